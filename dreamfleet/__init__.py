@@ -23,29 +23,29 @@ TYPE_CHECKING = False  # `typing` takes milliseconds, in which Ctrl-C would stil
 if TYPE_CHECKING:
     from typing import Any
 
+    from dreamfleet.common.addons.batches.remote_scorer import RemoteBatch, RemoteScorer
     from dreamfleet.common.artifacts.actions import Continuous, Discrete
     from dreamfleet.common.artifacts.bundle import Bundle
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.common.artifacts.controller import Controller, ControllerShape
     from dreamfleet.common.client.client import Client
-    from dreamfleet.common.client.remote_scorer import RemoteBatch, RemoteScorer
     from dreamfleet.common.errors import DreamfleetError, UsageError
     from dreamfleet.common.protocol.messages import TaskSpec
     from dreamfleet.common.protocol.tasks import Description
     from dreamfleet.common.runs.episode_results import EpisodeResults
-    from dreamfleet.coordinator.views.stored_run import StoredRun as Run
-    from dreamfleet.coordinator.views.stored_run import open_run
-    from dreamfleet.experiments.minimise import maximise, minimise
-    from dreamfleet.experiments.started_run import evolve, start_run
-    from dreamfleet.worker.scoring.scorer import Scorer
-    from dreamfleet.worker.tasks.api import Task, World
-    from dreamfleet.worker.tools.public_api import (
+    from dreamfleet.coordinator.addons.runs.stored_run import StoredRun as Run
+    from dreamfleet.coordinator.addons.runs.stored_run import open_run
+    from dreamfleet.experiments.controllers import (
         evaluate,
         find_agent,
         find_controller,
         make_environment,
         make_policy,
     )
+    from dreamfleet.experiments.minimise import maximise, minimise
+    from dreamfleet.experiments.started_run import evolve, start_run
+    from dreamfleet.worker.scoring.scorer import Scorer
+    from dreamfleet.worker.tasks.api import Task, World
 
 _HOMES = {
     "Bundle": "common.artifacts.bundle",
@@ -57,24 +57,24 @@ _HOMES = {
     "Discrete": "common.artifacts.actions",
     "DreamfleetError": "common.errors",
     "EpisodeResults": "common.runs.episode_results",
-    "RemoteBatch": "common.client.remote_scorer",
-    "RemoteScorer": "common.client.remote_scorer",
-    "Run": "coordinator.views.stored_run:StoredRun",
+    "RemoteBatch": "common.addons.batches.remote_scorer",
+    "RemoteScorer": "common.addons.batches.remote_scorer",
+    "Run": "coordinator.addons.runs.stored_run:StoredRun",
     "Scorer": "worker.scoring.scorer",
     "Task": "worker.tasks.api",
     "TaskSpec": "common.protocol.messages",
     "UsageError": "common.errors",
     "World": "worker.tasks.api",
-    "evaluate": "worker.tools.public_api",
+    "evaluate": "experiments.controllers",
     "evolve": "experiments.started_run",
-    "find_agent": "worker.tools.public_api",
+    "find_agent": "experiments.controllers",
     "find_bundle": "common.artifacts.bundle_store",
-    "find_controller": "worker.tools.public_api",
-    "make_environment": "worker.tools.public_api",
-    "make_policy": "worker.tools.public_api",
+    "find_controller": "experiments.controllers",
+    "make_environment": "experiments.controllers",
+    "make_policy": "experiments.controllers",
     "maximise": "experiments.minimise",
     "minimise": "experiments.minimise",
-    "open_run": "coordinator.views.stored_run",
+    "open_run": "coordinator.addons.runs.stored_run",
     "start_run": "experiments.started_run",
 }
 __all__ = [

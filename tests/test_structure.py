@@ -8,7 +8,9 @@ from deploy.structure import (
     SIDES,
     WORLDS,
     class_names,
+    core,
     floors,
+    lines,
     names_outside_rooms,
     room_arrows,
     sources,
@@ -18,13 +20,13 @@ from deploy.structure import (
 from dreamfleet.common.worlds import shipped
 
 MOST_FILES = 20  # in a folder
+MOST_LINES = 38_000  # of the core, which a newcomer must read
 MOST_VERBS, MOST_FLAGS = 54, 184  # of the command line; other settings are keys of `--set` and of files
 # Files that name a world outside its rooms. This list may only shrink.
 NAMING_WORLDS = {
-    "common/worlds/shipped.py": "the one list of the worlds that ship",
     "common/artifacts/driving.py": "the one default: files that name no world are CarRacing's, and have its variants",
     "common/host/packages.py": "packages and extras, as pyproject.toml names them",
-    "worker/health.py": "doctor asks it where gymnasium may be absent, which CarRacing's room imports",
+    "worker/addons/health.py": "doctor asks it where gymnasium may be absent, which CarRacing's room imports",
     "worker/dream/__init__.py": "an environment's former name, which notebooks and agents of others use",
     "worker/addons/bench/environment.py": "compares our CarRacing with gymnasium's, by the episode loop above its room",
     "worker/addons/baselines/agents.py": "baselines are agents of CarRacing, trained by rooms above its",
@@ -60,6 +62,10 @@ def mirrored(test: Path) -> str:
 def test_no_room_imports_a_room_above_it():
     for side in SIDES:
         assert floors(room_arrows(side))[1] == 0, side
+
+
+def test_the_core_can_be_read():
+    assert lines(core()) <= MOST_LINES
 
 
 def test_a_public_class_name_has_one_meaning():

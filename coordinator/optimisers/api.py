@@ -80,7 +80,7 @@ class Optimiser(Protocol):
     `footprint(dimension, population, options)`, a class method, returns a `Footprint`, so that a search which this
     host cannot hold is refused before it is built.
 
-    >>> from dreamfleet.coordinator.optimisers.cmaes_library import Separable
+    >>> from dreamfleet.coordinator.addons.optimisers.cmaes_library import Separable
     >>> optimiser: Optimiser = Separable(Search(mean=np.zeros(3), population=8, sigma0=0.5, seed=1))
     >>> for _ in range(100):
     ...     optimiser.tell(-np.square(optimiser.ask() - 1).sum(axis=1))

@@ -12,11 +12,11 @@ from time import monotonic
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.bundle_store import find_bundle
-from dreamfleet.common.cli.add_ons import add_on
 from dreamfleet.common.cli.global_config import GlobalConfig
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
 from dreamfleet.common.files.file_system import file_system_type, is_network, lock_problem
+from dreamfleet.common.host.add_ons import add_on, find_add_on
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.protocol.messages import Intervals
 from dreamfleet.common.runs.own_runs import remember_run
@@ -32,7 +32,6 @@ from dreamfleet.common.worlds.score_words import score_word
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.service.service import OpenRun, Service
 from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, RunConfig
-from dreamfleet.coordinator.settings.environment_check import check_environment
 from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
@@ -235,7 +234,8 @@ def _resolve_new_settings(
     if start is not None and config.needs_no_bundle == (not start.bundle):
         config = start.apply_to(config)
     bundle = None if config.needs_no_bundle else find_bundle(config.bundle or DEFAULT_BUNDLE)
-    config = check_environment(config, bundle, strict=strict)
+    if check_environment := find_add_on("check-environment"):
+        config = check_environment(config, bundle, strict=strict)
     settings = freeze(config, bundle)
     if start is not None:
         start.check(settings, bundle)

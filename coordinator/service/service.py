@@ -17,6 +17,7 @@ from typing import Any
 import zenoh
 
 from dreamfleet.common.errors import AccessError, DreamfleetError, JournalError, NotWritableNowError, RefusedError
+from dreamfleet.common.host.add_ons import add_on
 from dreamfleet.common.host.error_counter import ErrorCounter
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import CountingDecoder, encode, encode_json, encoding
@@ -44,7 +45,6 @@ from dreamfleet.coordinator.run.worker_protocol import WorkerMessage, WorkerProt
 from dreamfleet.coordinator.service.batch_queries import BatchQueries
 from dreamfleet.coordinator.service.control import Control
 from dreamfleet.coordinator.service.inbound_queue import InboundQueue
-from dreamfleet.coordinator.service.metrics_server import serve_metrics
 from dreamfleet.coordinator.service.name_lock import NameLock
 from dreamfleet.coordinator.service.queryables import declare_bundle, declare_status
 from dreamfleet.coordinator.service.run_log import RunLog
@@ -105,7 +105,9 @@ class Service:
         with ExitStack() as last, open_session(self._network) as session, ExitStack() as stack:
             self._name_lock = NameLock(session, self._name, self._nonce, stack)
             self._name_lock.acquire(linked=bool(self._network.connect))
-            last.enter_context(serve_metrics(self._metrics_port, lambda: self._snapshot, lambda: self._stopping))
+            if self._metrics_port:
+                serve_metrics = add_on("serve-metrics")
+                last.enter_context(serve_metrics(self._metrics_port, lambda: self._snapshot, lambda: self._stopping))
             declared = self._start(session, open_run())
             try:
                 self._loop(session)

@@ -42,8 +42,8 @@ from dreamfleet.common.runs.standard_error import format_with_error, standard_er
 from dreamfleet.common.worlds.profile import DemoPlan
 from dreamfleet.common.worlds.score_words import profile_of
 from dreamfleet.common.worlds.shipped import WORLDS
+from dreamfleet.coordinator.addons.status.status_panel import RunPanel
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE
-from dreamfleet.coordinator.views.status_panel import RunPanel
 from dreamfleet.experiments import command_lines
 from dreamfleet.experiments.local_run import START_SECONDS, LocalRun, has_begun
 
@@ -192,17 +192,17 @@ class Demo:
         seeds = plural(self._plan.tracks, f"unseen {self._profile.score_word}")
         self._print(f"judging run {demo_run.run}'s controller on {seeds}, in {self._plan.judge}")
         controller = self._runs_dir / demo_run.run / CONTROLLER
-        from dreamfleet.worker.tools.drivers import find_driver
-        from dreamfleet.worker.tools.evaluation import judge
+        from dreamfleet.worker.addons.evaluation.evaluation import judge
+        from dreamfleet.worker.addons.evaluation.named_agents import find_driver
 
         tracks = tuple(range(TEST.start, TEST.start + self._plan.tracks))
         report = judge(str(controller), find_driver(str(controller), self._runs_dir), tracks, usable_cores())
         return {each.seed: each.score for each in report.drives}
 
     def _record(self, controller: Path, seed: int, video: Path) -> None:
-        from dreamfleet.worker.dream.parallel_dream import ParallelDreamConfig
-        from dreamfleet.worker.tools.drivers import find_driver
-        from dreamfleet.worker.tools.recording import record, record_in_process
+        from dreamfleet.worker.addons.evaluation.named_agents import find_driver
+        from dreamfleet.worker.addons.recording.parallel_dream import ParallelDreamConfig
+        from dreamfleet.worker.addons.recording.recording import record, record_in_process
 
         agent, steps = find_driver(str(controller), self._runs_dir), self._plan.video_steps
         film = partial(record, agent, steps=steps, dreaming=ParallelDreamConfig())
@@ -264,7 +264,7 @@ class Demo:
                 self._print(f"  {LiveRunView.of_status(status).summary}")
 
     def _plot(self, demo_run: DemoRun) -> None:
-        from dreamfleet.coordinator.views.plot import fitness_figure, save_figure
+        from dreamfleet.coordinator.addons.runs.plot import fitness_figure, save_figure
 
         path = self._runs_dir / demo_run.run / PLOT
         with open_run(self._runs_dir, demo_run.run) as run:

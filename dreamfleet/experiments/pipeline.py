@@ -11,12 +11,13 @@ from dreamfleet.common.cli.command_line import parse_flags
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.host.stop_signals import Stop, never_stop
+from dreamfleet.worker.addons.bundles import verb as bundle
 from dreamfleet.worker.training.stages import StageReport
 from dreamfleet.worker.training.stages.bundle import BundleRequest, build_bundle
 from dreamfleet.worker.training.stages.collect import CollectRequest, collect_drives
 from dreamfleet.worker.training.stages.encode import EncodeRequest, encode_drives
 from dreamfleet.worker.training.stages.train import Model, TrainRequest, train_model
-from dreamfleet.worker.verbs import bundle, train
+from dreamfleet.worker.verbs import train
 
 COLLECT, VAE, ENCODE, MDNRNN, BUNDLE = STAGES = ("collect", "train.vae", "encode", "train.mdnrnn", "bundle")
 MORE = 4  # times as many updates as the VAE had are advised where it learnt too little

@@ -33,8 +33,8 @@ from dreamfleet.common.runs.own_runs import trust_own_run
 from dreamfleet.common.runs.records import StoredGeneration
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import default_runs_dir
+from dreamfleet.coordinator.addons.runs.stored_run import StoredRun
 from dreamfleet.coordinator.settings import run_setup
-from dreamfleet.coordinator.views.stored_run import StoredRun
 from dreamfleet.experiments import command_lines
 from dreamfleet.experiments.function_names import environment_for
 from dreamfleet.experiments.local_run import ALONE, POLL_INTERVAL, LocalFleet, LocalRun, has_begun, task_flags

@@ -50,7 +50,7 @@ def evolve(processes, seed):
 
 def drive(controller):
     """Scores on the fresh tracks, in this process."""
-    from dreamfleet.worker.scoring.agents import make_evaluation_spec
+    from dreamfleet.worker.addons.evaluation.agents import make_evaluation_spec
     from dreamfleet.worker.scoring.scorer import Scorer
 
     bundle = find_bundle(SETTINGS["bundle"])

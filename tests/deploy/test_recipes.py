@@ -17,7 +17,7 @@ import yaml
 from cloudcoil.models.keda import v1alpha1 as keda
 
 from dreamfleet.common.cli import command_line
-from dreamfleet.coordinator.views.prometheus import exposition
+from dreamfleet.coordinator.addons.metrics.prometheus import exposition
 from tests.support import tasks
 from tests.support.processes import DEADLINE, Line, environment, started
 from tests.support.samples import STATUS

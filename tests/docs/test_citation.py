@@ -1,5 +1,5 @@
 """The citation is valid and of this version; what the issue templates ask for can be typed.
-Tests coordinator/views/citation.py."""
+Tests coordinator/addons/runs/citation.py."""
 
 import re
 import subprocess
@@ -11,7 +11,7 @@ import pytest
 from packaging.version import Version
 
 from dreamfleet.common.cli.command_line import build_parser
-from dreamfleet.coordinator.views.citation import AUTHORS
+from dreamfleet.coordinator.addons.runs.citation import AUTHORS
 from tests.support.processes import DEADLINE, ROOT
 from tests.support.verbs import find_verb
 

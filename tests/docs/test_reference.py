@@ -10,8 +10,8 @@ import dreamfleet
 from deploy import reference
 from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.cli.global_config import TABLES
+from dreamfleet.coordinator.addons.metrics.prometheus import collect_metrics
 from dreamfleet.coordinator.settings import run_setup
-from dreamfleet.coordinator.views.prometheus import collect_metrics
 from dreamfleet.experiments.run_arguments import RunArguments
 from dreamfleet.experiments.started_run import setting_names
 from tests.support.samples import STATUS

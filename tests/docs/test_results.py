@@ -5,9 +5,9 @@ import subprocess
 
 import pytest
 
-from dreamfleet.common.runs.evaluation_report import read_evaluation_report
 from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.common.runs.seeds import TEST
+from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
 from tests.support.processes import DEADLINE, ROOT
 
 RECORDS = sorted((ROOT / "docs" / "lab" / "results").glob("*.json"))

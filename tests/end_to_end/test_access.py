@@ -1,5 +1,5 @@
 """A fleet with join files: who is let in, who may do what, and that a run is none the worse for the others.
-Tests common/security/access_rules.py, common/verbs/access.py and coordinator/storage/kept_revocations.py."""
+Tests common/security/access_rules.py, common/addons/access/verb.py and coordinator/storage/kept_revocations.py."""
 
 import time
 from concurrent.futures import ThreadPoolExecutor

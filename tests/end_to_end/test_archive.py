@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import TimeoutError as SlowPageError
 
 import dreamfleet
-from dreamfleet.common.client.elites import EliteArchive
+from dreamfleet.common.addons.analysis.elites import RunArchive
 from dreamfleet.common.host.reports import ADDRESS
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
@@ -31,7 +31,7 @@ def settings(random_bundle):
 def recorded(processes, name):
     with open_run(processes.runs, name) as run:
         vectors = np.stack([run.candidate(each.number, i) for each in run.history() for i in range(POPULATION)])
-        return vectors, run.measured_candidates(), EliteArchive.of(run)
+        return vectors, run.measured_candidates(), RunArchive.of(run)
 
 
 def check_page(processes, cell):

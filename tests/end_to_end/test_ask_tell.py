@@ -1,5 +1,8 @@
 """A search of somebody else's over a real fleet: batches over Zenoh, and what is killed amid one.
-Tests common/client/batch_client.py, common/client/remote_scorer.py and coordinator/service/batch_queries.py."""
+
+Tests common/addons/batches/batch_client.py, common/addons/batches/remote_scorer.py and
+coordinator/service/batch_queries.py.
+"""
 
 import subprocess
 import sys

@@ -10,7 +10,7 @@ import pytest
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL, ROLLOUTS
-from dreamfleet.coordinator.storage import backup
+from dreamfleet.coordinator.addons.runs import backup
 from tests.support.processes import call_here, processes_in
 from tests.support.same_bits import GENERATIONS, SETTINGS, outcome
 

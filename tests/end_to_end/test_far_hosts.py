@@ -12,7 +12,7 @@ from contextlib import ExitStack, closing, contextmanager
 
 import pytest
 
-from dreamfleet.common.security.authority import Authority
+from dreamfleet.common.addons.access.authority import Authority
 from tests.support import tasks
 from tests.support.hosts import new_host, require_hosts
 from tests.support.processes import free_port, processes_in

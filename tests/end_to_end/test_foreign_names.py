@@ -22,7 +22,7 @@ from dreamfleet.common.artifacts.trained_agent import AgentManifest, TrainedAgen
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.files.archives import ArchiveLimits, DamagedArchiveError, read_arrays
 from dreamfleet.common.runs.episode_results import EpisodeResult
-from dreamfleet.common.runs.evaluation_report import EvaluationReport
+from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
 from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
 from tests.support.processes import DEADLINE, ROOT, command
 

@@ -13,9 +13,9 @@ from contextlib import ExitStack
 
 import pytest
 
+from dreamfleet.common.addons.access.authority import Authority
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import DreamfleetError
-from dreamfleet.common.security.authority import Authority
 from dreamfleet.common.security.credentials import read_join_file
 from dreamfleet.common.transport.session import Network
 from dreamfleet.coordinator.addons.spawn.parcel import pack_wheel

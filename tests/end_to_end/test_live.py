@@ -1,5 +1,5 @@
 """Watching a live run: real coordinator, real workers, viewers that come, stay too long, and lie.
-Tests common/client/live.py and worker/verbs/live.py."""
+Tests common/addons/frames/live.py and worker/addons/live/verb.py."""
 
 import json
 import signal
@@ -9,9 +9,9 @@ from contextlib import ExitStack
 import msgspec
 import pytest
 
+from dreamfleet.common.addons.frames.live import LiveView
+from dreamfleet.common.addons.frames.mjpeg import read_parts
 from dreamfleet.common.client.client import Client
-from dreamfleet.common.client.live import LiveView
-from dreamfleet.common.client.mjpeg import read_parts
 from dreamfleet.common.errors import ConnectionFailedError, JournalError, UsageError
 from dreamfleet.common.host.processes import command
 from dreamfleet.common.protocol import keys

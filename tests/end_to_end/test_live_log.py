@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.coordinator.views.export import scalars_of
+from dreamfleet.coordinator.addons.runs.export import scalars_of
 from tests.support import tasks
 from tests.support.events import scalars
 

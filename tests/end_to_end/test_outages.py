@@ -1,5 +1,5 @@
 """Workers whose coordinator is out of sight for a while, and what a run says of workers that left.
-Tests coordinator/verbs/story.py."""
+Tests coordinator/addons/runs/story_verb.py."""
 
 import json
 import time

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.coordinator.views.plot import fitness_figure, save_figure
+from dreamfleet.coordinator.addons.runs.plot import fitness_figure, save_figure
 from dreamfleet.worker.addons.inspection.curve_sections import fitness_section
 from tests.support import tasks
 from tests.support.same_bits import outcome

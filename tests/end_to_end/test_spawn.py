@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from dreamfleet.common.security.authority import Authority
+from dreamfleet.common.addons.access.authority import Authority
 from dreamfleet.coordinator.addons.spawn.agent import process_start
 from dreamfleet.coordinator.addons.spawn.parcel import pack_wheel
 from tests.support import tasks

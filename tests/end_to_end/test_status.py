@@ -1,5 +1,5 @@
 """Watching a run from anywhere, to its end, and judging what it reports.
-Tests common/client/client.py, coordinator/verbs/status.py and coordinator/service/queryables.py."""
+Tests common/client/client.py, coordinator/addons/status/verb.py and coordinator/service/queryables.py."""
 
 import json
 import os
@@ -12,7 +12,7 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError, ControllerError
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.coordinator.verbs import status
+from dreamfleet.coordinator.addons.status import verb as status
 from tests.support import tasks
 from tests.support.processes import call_here
 

@@ -13,7 +13,7 @@ import pytest
 
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
-from dreamfleet.coordinator.views.stored_run import open_run
+from dreamfleet.coordinator.addons.runs.stored_run import open_run
 from dreamfleet.experiments.started_run import RunPausedError, _claim, _free_name, check_settings, evolve, start_run
 from tests.support.processes import DEADLINE, ROOT, environment
 from tests.support.tasks import RAISING

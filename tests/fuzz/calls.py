@@ -7,8 +7,8 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from shutil import copytree
 
+from dreamfleet.common.addons.access.authority import Authority
 from dreamfleet.common.cli.command_line import GROUP, build_parser, load_verb
-from dreamfleet.common.security.authority import Authority
 from tests.support.drives import write_drives
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"

@@ -2,7 +2,7 @@
 
 import time
 
-from dreamfleet.common.security.authority import Authority
+from dreamfleet.common.addons.access.authority import Authority
 from dreamfleet.common.security.credentials import read_join_file
 from dreamfleet.common.transport.session import Network
 from tests.support import tasks

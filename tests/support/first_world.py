@@ -26,12 +26,12 @@ from dreamfleet.common.artifacts.bundle import MANIFEST, write_bundle
 from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, DEFAULT_VARIANT, Variant
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES, fingerprint
 from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.common.runs.evaluation_report import read_evaluation_report
 from dreamfleet.common.runs.lookup import find_subspace
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.presets import find_preset
+from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
 from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.scoring.rollout import write_episode
 from dreamfleet.worker.scoring.scorer import Scorer

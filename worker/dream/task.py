@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 import gymnasium
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host.add_ons import add_on
 from dreamfleet.worker.dream.batch import MAX_ROWS, TORCH_ROWS, DreamBatch
 from dreamfleet.worker.tasks.api import Assignment, Policy, Task, World
 from dreamfleet.worker.tasks.registry import task_of
@@ -44,10 +45,10 @@ class DreamTask(Task):
         if not assignment.torch_device:
             return DreamBatch(model, spec)
         try:
-            from dreamfleet.worker.dream.torch_batch import TorchDreamBatch
+            batch: DreamBatch = add_on("torch-dreams")(model, spec, assignment.torch_device)
         except ModuleNotFoundError as error:
             raise UsageError(f"torch_device needs {error.name}: pip install 'dreamfleet[train]'") from error
-        return TorchDreamBatch(model, spec, assignment.torch_device)
+        return batch
 
     def reality(self, assignment: Assignment) -> Task:
         """The task that the bundle was trained on; `UsageError` if no package registers it."""

@@ -23,9 +23,9 @@ from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from dreamfleet.common.client.batch_client import BatchClient, is_final
+from dreamfleet.common.addons.batches.batch_client import BatchClient, is_final
+from dreamfleet.common.addons.batches.remote_scorer import scored_candidates
 from dreamfleet.common.client.client import Client
-from dreamfleet.common.client.remote_scorer import scored_candidates
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.printable import printable, truncate

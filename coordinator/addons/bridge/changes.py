@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from dreamfleet.common.client.batch_client import BatchClient
+from dreamfleet.common.addons.batches.batch_client import BatchClient
 from dreamfleet.common.protocol.batches import BatchEvent
 
 MOST_RUNS = 64  # whose events are subscribed to; streams of others ask now and then

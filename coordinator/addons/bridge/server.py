@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable
 from time import sleep
 
-from dreamfleet.common.client.batch_client import BatchClient
+from dreamfleet.common.addons.batches.batch_client import BatchClient
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError, HandshakeRejectedError
 from dreamfleet.common.host.stop_signals import interrupted_by_signals

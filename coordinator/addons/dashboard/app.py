@@ -23,8 +23,8 @@ from dreamfleet.coordinator.addons.dashboard.config import DashboardConfig
 from dreamfleet.coordinator.addons.dashboard.feed import Feed
 from dreamfleet.coordinator.addons.dashboard.guard import PageGuard
 from dreamfleet.coordinator.addons.dashboard.view_processes import ViewProcesses, ViewTarget
+from dreamfleet.coordinator.addons.metrics.prometheus import CONTENT_TYPE, exposition
 from dreamfleet.coordinator.addons.web.documents import event, json_response
-from dreamfleet.coordinator.views.prometheus import CONTENT_TYPE, exposition
 
 EVENTS = "text/event-stream"
 FULL = "too many pages are open: close some\n"

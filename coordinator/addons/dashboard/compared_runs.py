@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from dreamfleet.common.addons.analysis import comparison
+from dreamfleet.common.addons.analysis.comparison import ComparedRun
 from dreamfleet.common.errors import BundleError
 from dreamfleet.common.printable import format_setting, plural, printable
-from dreamfleet.common.runs import comparison
-from dreamfleet.common.runs.comparison import ComparedRun
 from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.run_folder import RunFolder, open_run

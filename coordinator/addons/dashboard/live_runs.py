@@ -11,8 +11,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
+from dreamfleet.common.addons.analysis.elites import RunArchive
 from dreamfleet.common.client.client import Client
-from dreamfleet.common.client.elites import EliteArchive
 from dreamfleet.common.client.status import Population, Status, WorkerStatus, read_document, read_status
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, HandshakeRejectedError
 from dreamfleet.common.printable import truncate
@@ -178,7 +178,7 @@ class _FollowedRun:
     _workers: Sequence[WorkerStatus] = ()
     _population: Sequence[Population] = ()
     _quartiles: dict[int, tuple[float, float]] | None = None  # `None`: no journal of it here
-    _archive: EliteArchive | None = None  # of a run with one, whose journal is on this disk
+    _archive: RunArchive | None = None  # of a run with one, whose journal is on this disk
     _archived: int = 0  # generations whose candidates are in it
     drawings: int = 0  # how often the curves were rendered
     _rendered_curves: tuple[Any, bytes] = (None, b"")  # cache key, event
@@ -187,7 +187,7 @@ class _FollowedRun:
         self._word = score_word(self.status.settings.task.task)
         with suppress(DreamfleetError), open_run(self.runs_dir, self.name) as stored:
             if stored.uid == self.uid:
-                self._quartiles, self._archive = {}, EliteArchive.empty(stored.settings)
+                self._quartiles, self._archive = {}, RunArchive.empty(stored.settings)
                 self._word = score_word_of_run(stored.spec, stored.bundle_path)
 
     @property

@@ -10,8 +10,9 @@ from math import isnan
 from pathlib import Path
 from typing import Any
 
+from dreamfleet.common.addons.analysis.elites import RunArchive
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.client.elites import Elite, EliteArchive
+from dreamfleet.common.client.elites import Elite
 from dreamfleet.common.client.run_view import RunView
 from dreamfleet.common.errors import DreamfleetError, JournalError
 from dreamfleet.common.printable import format_duration, printable
@@ -33,7 +34,7 @@ from dreamfleet.common.schema.times import format_time, parse_time
 from dreamfleet.coordinator.addons.dashboard.curves import Quartiles, RunData, cumulative_effort, curves, downsample
 from dreamfleet.coordinator.addons.dashboard.host_history import host_history
 from dreamfleet.coordinator.addons.dashboard.page_state import NONE, Facts, tile
-from dreamfleet.coordinator.views.run_details import run_row, setting_rows, view_of
+from dreamfleet.coordinator.addons.runs.run_details import run_row, setting_rows, view_of
 
 LAST = 20  # generations in the table
 MOST_READ = 256 << 20  # bytes of candidates that are read for quartiles
@@ -62,7 +63,7 @@ def describe_run(runs_dir: Path, name: str) -> dict[str, Any]:
             "tiles": _tiles(run, view, total), "facts": _about(run, view), "outcome": _outcome(run, view, total),
             "settings": [(name, printable(value), differs) for name, value, differs in rows], "world": _world(run),
             "curves": curves(data, read_quartiles(run, settings, downsample(history)), spent, view.word),
-            "archive": describe_archive(EliteArchive.of(run)),
+            "archive": describe_archive(RunArchive.of(run)),
             "generations": [_generation_row(in_values(each, run.spec)) for each in history[-LAST:][::-1]],
         }  # fmt: skip
 
@@ -80,7 +81,7 @@ def describe_hosts(runs_dir: Path, name: str) -> dict[str, Any]:
         }  # fmt: skip
 
 
-def describe_archive(archive: EliteArchive | None) -> dict[str, Any] | None:
+def describe_archive(archive: RunArchive | None) -> dict[str, Any] | None:
     """What the heat map of an archive needs: middles of cells, fitness by row, titles; `None` without an archive."""
     if archive is None:
         return None
@@ -95,7 +96,7 @@ def describe_archive(archive: EliteArchive | None) -> dict[str, Any] | None:
     }  # fmt: skip
 
 
-def _cell_texts(archive: EliteArchive) -> list[list[str]]:
+def _cell_texts(archive: RunArchive) -> list[list[str]]:
     """What `--cell` takes for the elite that each cell of the picture shows, by row; empty without one."""
     best: dict[tuple[int, ...], Elite] = {}
     for elite in archive.elites.values():

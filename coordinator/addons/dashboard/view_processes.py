@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from dreamfleet.common.client.mjpeg import read_parts
+from dreamfleet.common.addons.frames.mjpeg import read_parts
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.processes import VerbProcess
 from dreamfleet.common.printable import truncate

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from dreamfleet.common.client.elites import EliteArchive
+from dreamfleet.common.addons.analysis.elites import RunArchive
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import format_number
 from dreamfleet.common.protocol.measures import Axis, describe_measure
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.coordinator.views.plot import TITLE, ShownFigure
+from dreamfleet.coordinator.addons.runs.plot import TITLE, ShownFigure
 
 EMPTY = "#f2f2f2"  # of cells without an elite
 MOST_LABELS = 13  # of an axis
@@ -24,7 +24,7 @@ def archive_figure(run: RunFolder) -> ShownFigure:
 
     Over more than two axes a cell shows its best elite. `UsageError` for a run without an archive, or an empty one.
     """
-    archive = EliteArchive.of(run)
+    archive = RunArchive.of(run)
     if archive is None or not archive.elites:
         what = "has no archive: begin one with --archive" if archive is None else "has no elite yet: wait for the first"
         raise UsageError(f"run {run.name} {what}")

@@ -20,9 +20,9 @@ from dreamfleet.common.host.child import FunctionChild
 from dreamfleet.common.host.stop_signals import end_within
 from dreamfleet.common.printable import one_line, truncate
 from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.coordinator.addons.runs.export import scalars_of
 from dreamfleet.coordinator.addons.sinks.sinks import Sink, open_sink
 from dreamfleet.coordinator.settings.live_log import SinkName, parse_sink
-from dreamfleet.coordinator.views.export import scalars_of
 
 log = logging.getLogger(__name__)
 INTERVAL = 1.0  # seconds between two looks at the journal

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.bundle import SINGLE_PRECISION, WEIGHTS, Bundle
 from dreamfleet.common.artifacts.bundle_store import describe_bundle
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.cli.add_ons import add_on
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import path_exists
+from dreamfleet.common.host.add_ons import add_on
 from dreamfleet.common.host.stop_signals import Stop
 from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.common.runs.records import StoredEvaluation, best_evaluation
@@ -32,11 +32,12 @@ from dreamfleet.experiments.iteration.plan import MDNRNN, VAE, Phase
 from dreamfleet.experiments.iteration.requests import Requests
 from dreamfleet.experiments.kept_document import write_document
 from dreamfleet.experiments.local_run import LocalFleet, coordinator_words, evolve, has_ended
-from dreamfleet.worker.training.stages.bundle import ExtractRequest, build_bundle, extract_models
+from dreamfleet.worker.addons.bundles.extract import ExtractRequest, extract_models
+from dreamfleet.worker.addons.refit.refit_stage import refit_controller
+from dreamfleet.worker.addons.refit.subspace_stage import fit_subspace
+from dreamfleet.worker.training.stages.bundle import build_bundle
 from dreamfleet.worker.training.stages.collect import CollectReport, collect_drives, import_kept
 from dreamfleet.worker.training.stages.encode import EncodeRequest, encode_drives
-from dreamfleet.worker.training.stages.refit import refit_controller
-from dreamfleet.worker.training.stages.subspace import fit_subspace
 from dreamfleet.worker.training.stages.train import MODELS, Model, summarise, train_model
 
 log = logging.getLogger("dreamfleet.coordinator.iterate")

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dreamfleet.common.cli.add_ons import add_on
 from dreamfleet.common.cli.world_flags import OPTIONS, world_arguments
+from dreamfleet.common.host.add_ons import add_on
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.runs.seeds import VALIDATION
 from dreamfleet.experiments.command_lines import Words, options
@@ -18,10 +18,10 @@ from dreamfleet.experiments.iteration.layout import IterationFolder
 from dreamfleet.experiments.iteration.ledger import IterationLedger
 from dreamfleet.experiments.iteration.plan import EVOLVE, GATE, MDNRNN, VAE, Phase
 from dreamfleet.experiments.pipeline import read_bundle, read_training
+from dreamfleet.worker.addons.refit.refit_stage import RefitRequest
+from dreamfleet.worker.addons.refit.subspace_stage import SubspaceRequest
 from dreamfleet.worker.training.stages.bundle import BundleRequest
 from dreamfleet.worker.training.stages.collect import CollectRequest, ImportRequest
-from dreamfleet.worker.training.stages.refit import RefitRequest
-from dreamfleet.worker.training.stages.subspace import SubspaceRequest
 from dreamfleet.worker.training.stages.train import Model, TrainRequest
 
 GATE_SEED = VALIDATION.start + 30_000  # the first track of a gate: no evaluation and no confirmation has it

@@ -20,7 +20,7 @@ from dreamfleet.common.host.stop_signals import Stop, signals_deferred
 from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.transport.network import Network
-from dreamfleet.coordinator.settings.environment_check import CHECKED
+from dreamfleet.coordinator.addons.environment_check import CHECKED
 from dreamfleet.experiments import local_run
 from dreamfleet.experiments.command_lines import Words, command
 from dreamfleet.experiments.local_run import POLL_INTERVAL, has_begun, has_ended, task_flags

@@ -17,15 +17,15 @@ from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.printable import format_number, format_setting, plural
 from dreamfleet.common.protocol.function_values import value_of
 from dreamfleet.common.protocol.tasks import is_function_task
-from dreamfleet.common.runs.evaluation_report import EvaluationReport, read_evaluation_report
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.records import count_episodes, format_mean, with_error
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.score_words import score_word
+from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport, read_evaluation_report
 
 if TYPE_CHECKING:
-    from dreamfleet.common.runs.comparison import ComparedRun, EqualBudget, EvaluatedMean
+    from dreamfleet.common.addons.analysis.comparison import ComparedRun, EqualBudget, EvaluatedMean
 
 SUMMARY = (
     "compare runs (settings that differ, scores at equal steps and core-hours, confirmed scores), reports of "
@@ -123,7 +123,12 @@ def _warn(first: Path, base: EvaluationReport, path: Path, other: EvaluationRepo
 
 def _compare_runs(args: argparse.Namespace, names: Sequence[str]) -> int:
     """Print settings that differ, scores at equal budgets, and differences from the first run."""
-    from dreamfleet.common.runs.comparison import ComparedRun, are_comparable, at_equal_budget, differing_settings
+    from dreamfleet.common.addons.analysis.comparison import (
+        ComparedRun,
+        are_comparable,
+        at_equal_budget,
+        differing_settings,
+    )
 
     if len(names) < 2:
         raise UsageError(f"{names[0]} is one run: give another to compare it with")
@@ -175,7 +180,7 @@ def _run_row(side: ComparedRun) -> dict[str, object]:
 
 
 def _format_budget(sides: Sequence[ComparedRun], equal: EqualBudget) -> str:
-    from dreamfleet.common.runs.comparison import CORE_HOURS, budget_name
+    from dreamfleet.common.addons.analysis.comparison import CORE_HOURS, budget_name
 
     spent = f"{equal.spent:.3g}" if equal.what == CORE_HOURS else f"{equal.spent:,.0f}"
     parts = [f"{side.name} {_format_evaluation(look)}" for side, look in zip(sides, equal.evaluated_means, strict=True)]
@@ -190,7 +195,7 @@ def _format_evaluation(look: EvaluatedMean | None) -> str:
 
 def _run_differences(sides: Sequence[ComparedRun], equal: Sequence[EqualBudget]) -> Iterator[dict[str, Any]]:
     """Each run less the first: at equal budgets, then of confirmed scores."""
-    from dreamfleet.common.runs.comparison import difference, paired_scores
+    from dreamfleet.common.addons.analysis.comparison import difference, paired_scores
 
     for of, side, one, other in paired_scores(sides, equal):
         found = difference(one, other)

@@ -19,10 +19,10 @@ from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import stop_on_signals
 from dreamfleet.experiments.pipeline import PipelineRequest, make_world_model, read_bundle, read_training
+from dreamfleet.worker.addons.bundles.verb import use_bundle
 from dreamfleet.worker.training.stages import StageReport
 from dreamfleet.worker.training.stages.train import Model, TrainRequest
 from dreamfleet.worker.verbs import collect
-from dreamfleet.worker.verbs.bundle import use_bundle
 
 if TYPE_CHECKING:
     from dreamfleet.worker.training.presets import TrainConfig

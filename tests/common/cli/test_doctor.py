@@ -1,5 +1,5 @@
 """`doctor` in an installation with only a coordinator's packages, built from links.
-Tests health.py, common/verbs/doctor.py and worker/health.py."""
+Tests common/addons/doctor/health.py, common/addons/doctor/verb.py and worker/addons/health.py."""
 
 import json
 import os
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dreamfleet.common.cli.health import missing_for_role, run_checks
+from dreamfleet.common.addons.doctor.health import missing_for_role, run_checks
 from tests.support.processes import DEADLINE, ROOT, environment
 
 COORDINATOR = (

@@ -7,8 +7,8 @@ from time import monotonic
 
 import pytest
 
+from dreamfleet.common.addons.frames.live import LiveView
 from dreamfleet.common.client.client import Client
-from dreamfleet.common.client.live import LiveView
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import encode_json
 from dreamfleet.common.schema.validation import MalformedError

@@ -10,7 +10,7 @@ from dreamfleet.common.client.status import Candidate, read_document, read_statu
 from dreamfleet.common.protocol.codec import encode_json
 from dreamfleet.common.protocol.host_classes import HostClasses, HostClassShare
 from dreamfleet.common.schema.validation import MalformedError
-from dreamfleet.coordinator.verbs.status import print_runs
+from dreamfleet.coordinator.addons.status.verb import print_runs
 from tests.support.samples import STATUS
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "status.v2.json"

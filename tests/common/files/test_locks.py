@@ -8,8 +8,8 @@ import pytest
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.locks import folder_lock
 from dreamfleet.common.runs.run_lock import is_run_locked, run_lock
+from dreamfleet.coordinator.addons.runs import backup
 from dreamfleet.coordinator.addons.spawn.agent import Channel, FailedError, HostFolder
-from dreamfleet.coordinator.storage import backup
 
 LOCKS = {
     "folder": (lambda folder: folder_lock(folder / "lock", "`dreamfleet access`"), "lock"),

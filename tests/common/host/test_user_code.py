@@ -44,7 +44,7 @@ if __name__ == "__main__":
 """
 OWN = """
 from gymnasium.envs.classic_control import CartPoleEnv
-from dreamfleet.coordinator.optimisers.cmaes_library import Separable
+from dreamfleet.coordinator.addons.optimisers.cmaes_library import Separable
 class Pole(CartPoleEnv):
     pass
 class Own(Separable):

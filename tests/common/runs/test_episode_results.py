@@ -1,5 +1,5 @@
 """Evaluation results: statistics, reports, comparison and reproduction.
-Tests paired_difference.py and reproduction.py."""
+Tests paired_difference.py and worker/addons/verification/reproduction.py."""
 
 import json
 import re
@@ -11,9 +11,9 @@ import pytest
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
-from dreamfleet.common.runs.evaluation_report import EvaluationReport, read_evaluation_report
 from dreamfleet.common.runs.paired_difference import PairedDifference
-from dreamfleet.common.runs.reproduction import Reproduction
+from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport, read_evaluation_report
+from dreamfleet.worker.addons.verification.reproduction import Reproduction
 
 DRIVES = (
     EpisodeResult(10_000, 850.0, 1000, False, 50.0, 0.0),

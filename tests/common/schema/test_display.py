@@ -14,7 +14,7 @@ from dreamfleet.common.client.status import WorkerStatus, read_document, read_st
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.schema.display import DisplayedFields
-from dreamfleet.coordinator.views.stored_run import StoredRun
+from dreamfleet.coordinator.addons.runs.stored_run import StoredRun
 
 GOLDEN, RUNS = Path(__file__).parents[1] / "golden", Path(__file__).parents[2] / "fixtures" / "runs"
 SHAPE = ControllerShape(4, 2, hidden=3)

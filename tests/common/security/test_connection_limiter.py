@@ -8,8 +8,8 @@ from contextlib import ExitStack
 
 import pytest
 
+from dreamfleet.common.addons.access.authority import Authority
 from dreamfleet.common.errors import ConnectionFailedError
-from dreamfleet.common.security.authority import Authority
 from dreamfleet.common.security.connection_limiter import MAX_UNAUTHENTICATED
 from dreamfleet.common.security.credentials import read_join_file
 from dreamfleet.common.transport.session import Network, open_session

@@ -1,5 +1,5 @@
 """Join files: issued by an authority, validated strictly, and private.
-Tests authority.py and certificate_ledger.py."""
+Tests common/addons/access/authority.py and certificate_ledger.py."""
 
 import errno
 import json
@@ -15,14 +15,15 @@ from threading import Event
 
 import pytest
 
+from dreamfleet.common.addons.access import authority
+from dreamfleet.common.addons.access.authority import Authority
+from dreamfleet.common.addons.router import router
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import AccessError, UsageError
-from dreamfleet.common.security import authority, certificate_ledger
-from dreamfleet.common.security.authority import Authority
+from dreamfleet.common.security import certificate_ledger
 from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, CertificateLedger, RevocationWatcher
 from dreamfleet.common.security.credentials import MAX_BYTES, add_seat_to_name, read_join_file, worker_seat_identity
 from dreamfleet.common.security.handshake import diagnose_connection
-from dreamfleet.common.transport import router
 from dreamfleet.common.transport.network import Network
 from tests.support.processes import free_port
 

@@ -6,10 +6,10 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
+from dreamfleet.common.addons.access.authority import Authority
+from dreamfleet.common.addons.doctor.health import _check_join_file
 from dreamfleet.common.cli.command_line import main
-from dreamfleet.common.cli.health import _check_join_file
 from dreamfleet.common.errors import AccessError
-from dreamfleet.common.security.authority import Authority
 from dreamfleet.common.security.credentials import SEATS, format_join_file, issue_command, read_join_file
 from dreamfleet.common.security.handshake import EXPIRED, NOT_YET_VALID, check_certificate
 from tests.support.access import Access

@@ -1,5 +1,8 @@
 """What hosts without a simulator know of a shipped world is what its task says.
-Tests car_racing.py, known_score.py, profile.py, score_words.py, shipped.py and takecover.py."""
+
+Tests profile.py, score_words.py, shipped.py, common/addons/worlds/car_racing.py, common/addons/worlds/takecover.py and
+worker/addons/evaluation/known_score.py.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,12 +16,12 @@ from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.cli.presets import default_run_preset, default_training_preset
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import DREAM, is_shipped
-from dreamfleet.common.runs.evaluation_report import read_evaluation_report
 from dreamfleet.common.runs.seeds import TEST
-from dreamfleet.common.worlds.known_score import KnownScore, find_known_score, first_seed
 from dreamfleet.common.worlds.score_words import profile_of, score_word_of_run
 from dreamfleet.common.worlds.shipped import WORLDS
 from dreamfleet.coordinator.settings.config import RunConfig
+from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
+from dreamfleet.worker.addons.evaluation.known_score import KnownScore, find_known_score, first_seed
 from dreamfleet.worker.tasks.registry import find_world
 from dreamfleet.worker.training.presets import PRESETS
 from tests.support.bundles import write_world_bundle

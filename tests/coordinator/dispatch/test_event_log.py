@@ -4,9 +4,9 @@ import pytest
 
 from dreamfleet.common.client.status import WorkerCount, read_status
 from dreamfleet.common.protocol.messages import Result
+from dreamfleet.coordinator.addons.metrics.prometheus import exposition
 from dreamfleet.coordinator.dispatch.event_log import MAX_EVENTS, EventLog, latest
 from dreamfleet.coordinator.dispatch.fleet import DEPARTURE_GRACE, SILENT_AFTER
-from dreamfleet.coordinator.views.prometheus import exposition
 from tests.support.run_bench import A, B, Bench
 from tests.support.snapshots import SCORED, answered, score, snapshot_of
 

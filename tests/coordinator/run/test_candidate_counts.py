@@ -13,10 +13,10 @@ from dataclasses import replace
 import pytest
 
 from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.coordinator.addons.runs.export import export_csv, export_parquet, rows_of
+from dreamfleet.coordinator.addons.runs.stored_run import StoredRun
 from dreamfleet.coordinator.run.recall import recall
 from dreamfleet.coordinator.storage.verification_records import StoredBar
-from dreamfleet.coordinator.views.export import export_csv, export_parquet, rows_of
-from dreamfleet.coordinator.views.stored_run import StoredRun
 from tests.support import batch_door
 from tests.support.failing_runs import SETTINGS
 

@@ -1,5 +1,5 @@
 """The receipt in a reported controller: drawn up from the journal, and enough to begin the run again.
-Tests rerun.py."""
+Tests dreamfleet/experiments/rerun.py."""
 
 import json
 import sys
@@ -19,10 +19,10 @@ from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
-from dreamfleet.coordinator.settings.rerun import Rerun
 from dreamfleet.coordinator.settings.resume_settings import serving_facts
 from dreamfleet.coordinator.settings.start import StartPoint, find_start
 from dreamfleet.coordinator.storage.journal import Journal
+from dreamfleet.experiments.rerun import Rerun
 from tests.support.reporting_runs import EVALUATED, Reporting
 
 

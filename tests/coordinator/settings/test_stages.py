@@ -15,12 +15,12 @@ from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.common.runs.records import StageSettings
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages
+from dreamfleet.coordinator.addons.status.status_panel import RunPanel
 from dreamfleet.coordinator.jobs.work import vector_bytes
 from dreamfleet.coordinator.optimisers.evolution import Evolution
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.settings.fork import Fork
 from dreamfleet.coordinator.settings.limits import LimitsConfig
-from dreamfleet.coordinator.views.status_panel import RunPanel
 from tests.coordinator.evaluated import EVERY, Evaluated
 from tests.support.run_bench import SETTINGS
 from tests.support.samples import SPEC

@@ -18,8 +18,8 @@ from dreamfleet.coordinator.optimisers.api import Search
 from dreamfleet.coordinator.optimisers.evolution import Evolution
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.freezing import freeze
-from dreamfleet.coordinator.settings.rerun import Rerun
 from dreamfleet.coordinator.settings.start import stored_subspace
+from dreamfleet.experiments.rerun import Rerun
 
 SHAPE = ControllerShape(9, 2)
 OPTIMISERS = [("cma", "diagonal"), ("cma", "full"), ("cmaes-sep", "diagonal"), ("cmaes-lra", "diagonal")]

@@ -21,12 +21,12 @@ from dreamfleet.common.cli import command_line
 from dreamfleet.common.errors import DreamfleetError, JournalError
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
+from dreamfleet.coordinator.addons.runs.backup import back_up
+from dreamfleet.coordinator.addons.runs.stored_run import StoredRun
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
-from dreamfleet.coordinator.storage.backup import back_up
 from dreamfleet.coordinator.storage.journal import Journal
-from dreamfleet.coordinator.views.stored_run import StoredRun
 from tests.support.failing_runs import SETTINGS, Failing, by_vector
 
 PAGE = 4096

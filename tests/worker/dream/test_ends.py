@@ -9,9 +9,9 @@ from dreamfleet.common.artifacts.bundle import write_bundle
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
 from dreamfleet.common.errors import BundleError
 from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.worker.addons.recording.parallel_dream import DreamContinuation, ParallelDream, ParallelDreamConfig
 from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.dream.noise import EpisodeNoise
-from dreamfleet.worker.dream.parallel_dream import DreamContinuation, ParallelDream, ParallelDreamConfig
 from dreamfleet.worker.dream.world import DreamEnds, DreamWorld
 from dreamfleet.worker.worldmodel.inference import DreamStep
 from tests.support.dreams import with_end, write_bundle_of

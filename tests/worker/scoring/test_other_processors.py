@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from dreamfleet.common.artifacts.bundle_store import find_bundle
-from dreamfleet.worker.training.eight_bits import write_eight_bit_bundle
+from dreamfleet.worker.addons.bundles.eight_bits import write_eight_bit_bundle
 
 PROGRAM = """
 import sys

@@ -22,6 +22,9 @@ from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.worker.addons.bundles.unbundle import unbundle
+from dreamfleet.worker.addons.refit.fit_subspace import find_subspace, make_targets
+from dreamfleet.worker.addons.refit.refit import output_bounds, output_names, refit
 from dreamfleet.worker.dream.world import DreamWorld
 from dreamfleet.worker.scoring.rollout import DataWorld
 from dreamfleet.worker.scoring.scorer import Scorer
@@ -32,10 +35,7 @@ from dreamfleet.worker.training.data.collect import collect
 from dreamfleet.worker.training.data.collect_config import CollectConfig
 from dreamfleet.worker.training.data.dataset import episode_paths, load_arrays
 from dreamfleet.worker.training.encode import encode
-from dreamfleet.worker.training.fit_subspace import find_subspace, make_targets
 from dreamfleet.worker.training.presets import TrainConfig
-from dreamfleet.worker.training.refit import output_bounds, output_names, refit
-from dreamfleet.worker.training.unbundle import unbundle
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.policy import ModelPolicy
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig

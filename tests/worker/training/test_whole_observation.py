@@ -9,12 +9,12 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.addons.driving.scene import DreamScene
-from dreamfleet.worker.scoring.agents import make_agent
+from dreamfleet.worker.addons.evaluation.agents import make_agent
+from dreamfleet.worker.addons.evaluation.evaluation import evaluate
+from dreamfleet.worker.addons.recording.recording import record
 from dreamfleet.worker.scoring.episode import EpisodeConfig, score
 from dreamfleet.worker.scoring.rollout import write_episode
 from dreamfleet.worker.scoring.scorer import Scorer
-from dreamfleet.worker.tools.evaluation import evaluate
-from dreamfleet.worker.tools.recording import record
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble
 from dreamfleet.worker.training.data.collect import collect, import_rollouts

@@ -21,12 +21,12 @@ from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import describe_task
 from dreamfleet.worker.addons.baselines.presets import CHECKPOINT
-from dreamfleet.worker.scoring.agents import Agent, EvolvedAgent
+from dreamfleet.worker.addons.evaluation.agents import Agent, EvolvedAgent
+from dreamfleet.worker.addons.evaluation.named_agents import DISCRETE, RANDOM
 from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT
 from dreamfleet.worker.tasks.drivers import UniformActions
 from dreamfleet.worker.tasks.policy import NO_PARAMETERS
 from dreamfleet.worker.tasks.registry import find_task
-from dreamfleet.worker.tools.drivers import DISCRETE, RANDOM
 from dreamfleet.worker.worlds.car_racing.agents import NetworkAgent, PictureAgent
 from dreamfleet.worker.worlds.car_racing.preprocessing import RAW
 

@@ -15,7 +15,7 @@ from dreamfleet.common.cli.presets import check_preset
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.messages import Share
 from dreamfleet.common.schema.validation import Count
-from dreamfleet.worker.tools.drivers import DISCRETE, RANDOM
+from dreamfleet.worker.addons.evaluation.named_agents import DISCRETE, RANDOM
 
 DRQN = "drqn"
 NAMES = (RANDOM, DISCRETE, DRQN)  # of the baselines

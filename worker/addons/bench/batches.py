@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from dreamfleet.common.client.remote_scorer import RemoteScorer
+from dreamfleet.common.addons.batches.remote_scorer import RemoteScorer
 from dreamfleet.common.host.processes import VerbProcess
 from dreamfleet.common.host.reports import ADDRESS
 from dreamfleet.worker.addons.bench.dispatch import Figures, start_run

@@ -44,7 +44,7 @@ def bench_dream(bundle: Bundle) -> dict[str, Any]:
     note = ""
     try:
         from dreamfleet.worker.addons.bench.torch_steps import has_cuda, make_torch_dream
-        from dreamfleet.worker.dream.torch_batch import TorchDreamBatch
+        from dreamfleet.worker.addons.torch_dreams.torch_batch import TorchDreamBatch
 
         cases["torch"] = make_torch_dream(bundle, TILE)
         if has_cuda() and EIGHT_BITS not in bundle.manifest.models:

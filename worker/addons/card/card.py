@@ -13,13 +13,13 @@ from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
 from dreamfleet.common.files.regular_files import read_regular
 from dreamfleet.common.host.stop_signals import Stop, never_stop
 from dreamfleet.common.runs.episode_results import EpisodeResult
-from dreamfleet.common.runs.evaluation_report import EvaluationReport
-from dreamfleet.common.worlds.known_score import first_seed
 from dreamfleet.worker.addons.card import card_page
-from dreamfleet.worker.scoring.agents import Agent, make_agent, make_evaluation_spec
+from dreamfleet.worker.addons.evaluation.agents import Agent, make_agent, make_evaluation_spec
+from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
+from dreamfleet.worker.addons.evaluation.known_score import first_seed
+from dreamfleet.worker.addons.recording.video_cli import MOST_STEPS
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_scored_task, task_of
-from dreamfleet.worker.tools.video_cli import MOST_STEPS
 
 
 def write_card(
@@ -67,7 +67,7 @@ def _try(contents: card_page.CardContents, name: str, write: Callable[[], None])
 
 
 def _write_driver(contents: card_page.CardContents, path: Path) -> None:
-    from dreamfleet.worker.worldmodel.driver_graph import export_driver, largest_difference  # the package onnx
+    from dreamfleet.worker.addons.card.driver_graph import export_driver, largest_difference  # the package onnx
 
     assert contents.bundle is not None
     graph = export_driver(contents.bundle, contents.controller)
@@ -88,7 +88,7 @@ def _write_script(contents: card_page.CardContents, folder: Path) -> None:
 
 
 def _film(contents: card_page.CardContents, path: Path, steps: int, on_step: Callable[[int], None], stop: Stop) -> None:
-    from dreamfleet.worker.tools.recording import record, record_in_process  # PyAV
+    from dreamfleet.worker.addons.recording.recording import record, record_in_process  # PyAV
 
     agent = make_agent(contents.controller, contents.bundle)
     seed, most = _seed_to_film(contents.report, agent), min(steps, agent.world.horizon)

@@ -15,10 +15,10 @@ from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.printable import one_line, plural
 from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.common.runs.episode_results import EpisodeResult
-from dreamfleet.common.runs.evaluation_report import EvaluationReport
 from dreamfleet.common.runs.standard_error import format_with_error
-from dreamfleet.common.worlds.known_score import find_known_score
 from dreamfleet.common.worlds.score_words import profile_of, score_word
+from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
+from dreamfleet.worker.addons.evaluation.known_score import find_known_score
 
 PAGE, CONTROLLER, BUNDLE, REPORT = "README.md", "controller.npz", "bundle.zip", "evaluation.json"
 DRIVER, SCRIPT, SCORES = "controller.onnx", "drive.py", "scores.png"

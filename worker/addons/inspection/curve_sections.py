@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
-from dreamfleet.common.client.fitness_chart import PLOT_COLOURS, draw_fitness, has_score_panel
+from dreamfleet.common.addons.analysis.fitness_chart import PLOT_COLOURS, draw_fitness, has_score_panel
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages, join_distinct
 from dreamfleet.worker.addons.inspection.charts import FONT, new_figure, render_png

@@ -19,6 +19,7 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.addons.inspection.encoded_rollout import ConstantDriver
 from dreamfleet.worker.addons.inspection.probe import Estimate
+from dreamfleet.worker.addons.recording.canvas import choice_name
 from dreamfleet.worker.dream.batch import MAX_ROWS
 from dreamfleet.worker.dream.noise import SharedNoise
 from dreamfleet.worker.dream.world import DreamEnds, DreamWorld
@@ -28,7 +29,6 @@ from dreamfleet.worker.tasks.api import Assignment, Driver, Task, World
 from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tasks.policy import NO_PARAMETERS, DriverPolicy
 from dreamfleet.worker.tasks.registry import task_of
-from dreamfleet.worker.tools.canvas import choice_name
 
 Lengths = NDArray[np.int64]
 DriverMaker = Callable[[np.random.Generator], Driver]

@@ -1,4 +1,4 @@
-"""Bundling: trained models as one file, and a bundle taken apart again."""
+"""Bundling: trained models as one file."""
 
 from __future__ import annotations
 
@@ -62,26 +62,6 @@ class BundleReport(StageReport):
         return f"{self.bundle}: {size}, sha256 {self.sha256}, {controllers}, {self.recorded} recorded states"
 
 
-@dataclass(frozen=True)
-class ExtractRequest:
-    """The models of `bundle`, a file or one that ships, as checkpoints in the folder `data`."""
-
-    bundle: str
-    data: Path
-
-
-@dataclass(frozen=True)
-class ExtractReport(StageReport):
-    """The checkpoints, and the SHA-256 of the bundle."""
-
-    vae: Path
-    mdnrnn: Path
-    bundle: str
-
-    def __str__(self) -> str:
-        return f"{self.vae} and {self.mdnrnn}, of {self.bundle[:12]}"
-
-
 def build_bundle(request: BundleRequest, _stop: Stop = never_stop) -> BundleReport:
     """Write the bundle; errors as in `assemble`."""
     from dreamfleet.worker.training.assemble import assemble
@@ -91,12 +71,3 @@ def build_bundle(request: BundleRequest, _stop: Stop = never_stop) -> BundleRepo
         name: getattr(request, name) for name in ("with_weights", "recorded", "measured", "reward", "end")
     }
     return BundleReport.of(assemble(request.data, request.out, request.out.stem, **more))
-
-
-def extract_models(request: ExtractRequest, _stop: Stop = never_stop) -> ExtractReport:
-    """Write the checkpoints; errors as in `unbundle`."""
-    from dreamfleet.common.artifacts.bundle_store import find_bundle
-    from dreamfleet.worker.training.unbundle import unbundle
-
-    bundle = find_bundle(request.bundle)
-    return ExtractReport(*unbundle(bundle, request.data), bundle.sha256)

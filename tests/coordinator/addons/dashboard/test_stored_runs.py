@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from dreamfleet.common.client.elites import Elite, EliteArchive
+from dreamfleet.common.addons.analysis.elites import RunArchive
+from dreamfleet.common.client.elites import Elite
 from dreamfleet.common.protocol.measures import parse_axes
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.coordinator.addons.dashboard import stored_runs
@@ -45,10 +46,10 @@ def test_an_archive_is_described_for_its_heat_map_and_other_runs_have_none(runs)
     assert stored_runs.describe_run(runs, "reality")["archive"] is None
     axes = parse_axes(("speed=0:100:2", "braking=0:1:3"))
     elites = {(1, 2): Elite((1, 2), 4, 5, 7.5, (60.0, 0.9))}
-    found = stored_runs.describe_archive(EliteArchive(axes, elites))
+    found = stored_runs.describe_archive(RunArchive(axes, elites))
     assert (found["x"], found["filled"]) == ([25.0, 75.0], 1)
     assert found["z"] == [[None, None], [None, None], [None, 7.5]]
     assert found["cells"] == [["", ""], ["", ""], ["", "1,2"]]
     assert "1 of 6 cells filled" in found["caption"]
-    one = stored_runs.describe_archive(EliteArchive(axes[:1], {}))
+    one = stored_runs.describe_archive(RunArchive(axes[:1], {}))
     assert (one["z"], one["y_title"], one["filled"]) == ([[None, None]], "", 0)

@@ -15,11 +15,11 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.tensorboard import EVENTS, read_scalars
 from dreamfleet.common.host.packages import hidden
 from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.coordinator.addons.runs.export import scalars_of
 from dreamfleet.coordinator.addons.sinks.live_log import follow, live_log
 from dreamfleet.coordinator.addons.sinks.sinks import check_sinks
 from dreamfleet.coordinator.settings.live_log import SinkName, parse_sink
 from dreamfleet.coordinator.settings.network import NetworkConfig
-from dreamfleet.coordinator.views.export import scalars_of
 from tests.support.events import scalars
 from tests.support.processes import ROOT
 

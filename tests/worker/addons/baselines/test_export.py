@@ -17,16 +17,16 @@ from dreamfleet.common.artifacts.bundle import DREAM_GRAPH
 from dreamfleet.common.artifacts.trained_agent import MANIFEST, NETWORK, TrainedAgent
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import ControllerError, DatasetError
-from dreamfleet.common.runs.evaluation_report import read_evaluation_report
 from dreamfleet.common.runs.lookup import find_agent, find_controller
 from dreamfleet.worker.addons.baselines.export import export_agent, export_network
 from dreamfleet.worker.addons.baselines.network import Networks, QPolicy
 from dreamfleet.worker.addons.baselines.presets import AgentConfig, LearningConfig
 from dreamfleet.worker.addons.baselines.train import CHECKPOINT, train_drqn
-from dreamfleet.worker.scoring.agents import make_agent
+from dreamfleet.worker.addons.evaluation import evaluation
+from dreamfleet.worker.addons.evaluation.agents import make_agent
+from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.policy import NO_PARAMETERS
-from dreamfleet.worker.tools import evaluation
 from dreamfleet.worker.training.checkpoint import save_checkpoint
 from dreamfleet.worker.worldmodel.inference import open_graph
 from dreamfleet.worker.worlds.car_racing.agents import NetworkPolicy

@@ -10,14 +10,14 @@ import torch
 
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.errors import ControllerError, DatasetError
-from dreamfleet.common.runs.evaluation_report import read_evaluation_report
 from dreamfleet.worker.addons.baselines.network import Networks
 from dreamfleet.worker.addons.baselines.presets import DISCRETE, DRQN, NAMES, RANDOM, AgentConfig
 from dreamfleet.worker.addons.baselines.train import CHECKPOINT
+from dreamfleet.worker.addons.evaluation import evaluation
+from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
+from dreamfleet.worker.addons.evaluation.named_agents import find_driver
+from dreamfleet.worker.addons.recording.recording import record
 from dreamfleet.worker.scoring.episode import EpisodeConfig
-from dreamfleet.worker.tools import evaluation
-from dreamfleet.worker.tools.drivers import find_driver
-from dreamfleet.worker.tools.recording import record
 from dreamfleet.worker.training.checkpoint import save_checkpoint
 from dreamfleet.worker.worldmodel.vae import VAE
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig

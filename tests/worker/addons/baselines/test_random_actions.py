@@ -1,5 +1,5 @@
 """Uniform random actions are judged in any environment by the path that judges a controller of that task.
-Tests agents.py and worker/tools/drivers.py."""
+Tests agents.py and worker/addons/evaluation/named_agents.py."""
 
 import json
 import re
@@ -12,9 +12,9 @@ from dreamfleet.common.artifacts.actions import FIVE_CHOICES, STEERING_GAS_BRAKE
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.runs.evaluation_report import read_evaluation_report
 from dreamfleet.worker.addons.baselines.agents import RandomPolicy
-from dreamfleet.worker.tools.drivers import find_driver
+from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
+from dreamfleet.worker.addons.evaluation.named_agents import find_driver
 
 CARTPOLE, LANDER = "gym:CartPole-v1", "gym:LunarLander-v3"
 

@@ -21,11 +21,11 @@ from dreamfleet import evaluate
 from dreamfleet.common.artifacts.controller import IMPORTED, Controller, ControllerShape
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.printable import one_line
-from dreamfleet.common.runs.evaluation_report import read_evaluation_report
 from dreamfleet.common.runs.standard_error import format_with_error
-from dreamfleet.common.worlds.known_score import find_known_score
 from dreamfleet.worker.addons.card.card_page import CardContents, describe_card
 from dreamfleet.worker.addons.card.score_chart import draw_scores
+from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
+from dreamfleet.worker.addons.evaluation.known_score import find_known_score
 from dreamfleet.worker.tasks.registry import find_task
 from tests.support.processes import ROOT
 

@@ -92,7 +92,7 @@ def test_a_reward_head_that_was_never_trained_is_left_out(imported, tmp_path):
 
 @pytest.mark.slow
 def test_training_goes_on_from_such_a_bundle(imported, tmp_path):
-    from dreamfleet.worker.training.unbundle import unbundle
+    from dreamfleet.worker.addons.bundles.unbundle import unbundle
 
     vae, rnn = unbundle(imported[2], tmp_path)
     assert vae.exists()

@@ -1,4 +1,4 @@
-"""Tests recorded_states.py, worker/training/stages/bundle.py and worker/verbs/bundle.py."""
+"""Tests recorded_states.py, worker/training/stages/bundle.py and worker/addons/bundles/verb.py."""
 
 import json
 import shutil
@@ -8,6 +8,7 @@ import pytest
 
 from dreamfleet.common.artifacts.bundle import RECORDED_STATES, Bundle
 from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.worker.addons.bundles import verb as verbs
 from dreamfleet.worker.addons.inspection.page_builder import manifest_facts
 from dreamfleet.worker.dream.environment import Dream
 from dreamfleet.worker.training import train_mdnrnn, train_vae
@@ -15,7 +16,6 @@ from dreamfleet.worker.training.assemble import assemble
 from dreamfleet.worker.training.data.dataset import load_arrays
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.presets import TrainConfig
-from dreamfleet.worker.verbs import bundle as verbs
 from dreamfleet.worker.worldmodel.inference import DreamStep, RewardLabel
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig

@@ -5,9 +5,9 @@ import re
 import numpy as np
 import pytest
 
+from dreamfleet.common.addons.task_check.task_check import try_task
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.artifacts.objective import Objective
-from dreamfleet.common.cli.task_check import try_task
 from dreamfleet.common.errors import RefusedError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import family_of, module_of

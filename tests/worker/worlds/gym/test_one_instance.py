@@ -8,12 +8,12 @@ import pytest
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
 from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.worker.scoring.agents import make_agent
+from dreamfleet.worker.addons.evaluation.agents import make_agent
+from dreamfleet.worker.addons.evaluation.evaluation import evaluate
+from dreamfleet.worker.addons.recording.recording import record
+from dreamfleet.worker.addons.task_check import dry_run
 from dreamfleet.worker.scoring.rollout import DataWorld
 from dreamfleet.worker.scoring.scorer import Scorer
-from dreamfleet.worker.scoring.task_check import dry_run
-from dreamfleet.worker.tools.evaluation import evaluate
-from dreamfleet.worker.tools.recording import record
 from dreamfleet.worker.training.data.collect import drive_episode
 from dreamfleet.worker.training.data.collect_config import CollectConfig
 from dreamfleet.worker.worlds.gym.task import GymTask

@@ -1,0 +1,1 @@
+"""What both sides' add-ons share, and verbs of any host that no run needs."""

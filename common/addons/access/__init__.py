@@ -1,0 +1,1 @@
+"""Join files: an authority issues, lists and revokes them."""

@@ -1,0 +1,1 @@
+"""What runs and their curves have in common: charts, comparison, learning."""

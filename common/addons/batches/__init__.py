@@ -1,0 +1,1 @@
+"""Candidates of your own, scored by a fleet."""

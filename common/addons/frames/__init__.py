@@ -1,0 +1,1 @@
+"""Pictures that a run or a view sends while it happens."""

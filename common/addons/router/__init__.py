@@ -1,0 +1,1 @@
+"""A Zenoh router between hosts that do not reach each other."""

@@ -1,0 +1,97 @@
+"""`dreamfleet router`: a meeting point for coordinators and workers that cannot reach each other."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Event
+
+from dreamfleet.common.cli.config import add_flags, load, option
+from dreamfleet.common.cli.global_config import GlobalConfig, add_global_flags, load_credentials
+from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.files.atomic_write import open_new
+from dreamfleet.common.host.resource_limits import raise_open_file_limit
+from dreamfleet.common.host.standard_streams import make_stderr_nonblocking
+from dreamfleet.common.host.stop_signals import SIGNALS
+from dreamfleet.common.transport.network import DEFAULT_ENDPOINT, SECURED_ENDPOINT, Network
+
+SUMMARY = "forward messages between coordinators and workers that connect here; it stores nothing and may be restarted"
+EXTRAS = ()
+
+
+@dataclass(frozen=True)
+class RouterConfig:
+    """Where a router of its own is reached. The site's `connect` is that very address, so it does not follow it."""
+
+    listen: tuple[str, ...] = option((), f"listen here (default {DEFAULT_ENDPOINT})")
+    connect: tuple[str, ...] = option((), "link to these routers of other networks, whenever they are there")
+    insecure: bool = option(
+        False, "listen beyond this host without a join file: anyone who reaches the port owns the runs behind it"
+    )
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    add_flags(parser, RouterConfig)
+    add_global_flags(parser, "join", "access_dir")
+    parser.add_argument(
+        "--print-config",
+        action="store_true",
+        help="print the configuration with which Zenoh's own zenohd does the same, and exit",
+    )
+    parser.add_argument(
+        "--write-config", type=Path, metavar="FILE.json5",
+        help="write that to a new file of mode 600, with the join file's secrets, and exit",
+    )  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> int:
+    """Route until Ctrl-C or SIGTERM."""
+    from dreamfleet.common.addons.router.router import run_router
+    from dreamfleet.common.security.certificate_ledger import RevocationWatcher
+    from dreamfleet.common.transport.session import zenoh_config
+
+    make_stderr_nonblocking()
+    raise_open_file_limit()
+    config = load(RouterConfig, "router", **args.sources)
+    credentials = load_credentials(args, ("router",))
+    access_dir = args.global_config.access_dir
+    revocations = RevocationWatcher(access_dir, credentials, named=access_dir != GlobalConfig.access_dir)
+    default = DEFAULT_ENDPOINT if credentials is None else SECURED_ENDPOINT
+    network = Network(
+        config.listen or args.global_config.listen or (default,), config.connect, credentials, revocations.revoked_seats
+    )
+    network.check_open(insecure=config.insecure)
+    if args.print_config:
+        if credentials is not None:
+            raise UsageError("--print-config would print what the join file keeps secret: --write-config FILE.json5")
+        print(json.dumps(zenoh_config(network, None), indent=2))
+        return 0
+    if args.write_config is not None:
+        _write_config(args.write_config, network)
+        return 0
+    stopped = Event()
+    for number in SIGNALS:
+        signal.signal(number, lambda *_: stopped.set())
+    run_router(network, stopped, revocations)
+    return 0
+
+
+def _write_config(path: Path, network: Network) -> None:
+    """Write zenohd's configuration to a file, with certificates and keys in it."""
+    from dreamfleet.common.transport.session import zenoh_config
+
+    if path.suffix not in (".json", ".json5"):
+        raise UsageError(f"--write-config {path}: zenohd knows what it reads by its name: end it in .json5")
+    if network.credentials is not None and network.credentials.uses_passwords:
+        raise UsageError("--write-config is for certificates: of a fleet with passwords let this verb be the router")
+    try:
+        with open_new(path) as file:
+            file.write(json.dumps(zenoh_config(network, None), indent=2).encode())
+    except FileExistsError:
+        raise UsageError(f"--write-config {path} exists: name another") from None
+    except OSError as error:
+        raise DreamfleetError(f"cannot write {path}: {error.strerror}; choose another --write-config") from error

@@ -1,0 +1,1 @@
+"""A task tried in a child process before a run uses it."""

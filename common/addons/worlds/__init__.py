@@ -1,0 +1,1 @@
+"""The worlds that ship: presets of their runs and trainings, published scores, demonstrations."""

@@ -1,0 +1,115 @@
+"""`/metrics` of a coordinator: a read-only thread that answers from the latest snapshot."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from time import monotonic, sleep
+
+from dreamfleet.common.errors import ConnectionFailedError
+from dreamfleet.common.transport.network import parse_metrics_address
+from dreamfleet.coordinator.service.snapshot import Snapshot
+
+PATIENCE = 5.0  # seconds for a request and its response: the server handles one client at a time
+POLL = 0.1  # seconds
+LONGEST = 90.0  # seconds that an ended run waits for its scraper to see that it ended
+
+
+@contextmanager
+def serve_metrics(where: str, snapshot: Callable[[], Snapshot], stopped: Callable[[], bool]) -> Iterator[None]:
+    """Serve metrics at the address `where`; `ConnectionFailedError` if the port is taken.
+
+    After a run has ended, the port stays open for one more scrape, if a scraper keeps its interval and nobody has
+    `stopped` the coordinator. Otherwise no scraper would see the end and the confirmed score.
+    """
+    try:
+        server = _MetricsServer(parse_metrics_address(where), _handler(snapshot))
+    except OSError as error:
+        raise ConnectionFailedError(
+            f"cannot serve metrics at {where}: {error.strerror}; choose another --metrics-port"
+        ) from error
+    thread = threading.Thread(target=server.serve_forever, args=(0.2,), name="metrics", daemon=True)
+    thread.start()
+    try:
+        yield
+        if snapshot().status.state == "ended":
+            since = monotonic()
+            while server.scrapes.is_expected(since, monotonic()) and not stopped():
+                sleep(POLL)
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+class ScrapeTimes:
+    """When a client scraped last, and the run state that it saw."""
+
+    def __init__(self) -> None:
+        self._at: float | None = None
+        self._interval = 0.0  # seconds between the last two times
+        self._state = ""
+
+    def record(self, state: str, now: float) -> None:
+        """A client has scraped and seen this run state."""
+        self._interval = 0.0 if self._at is None else now - self._at
+        self._at, self._state = now, state
+
+    def is_expected(self, since: float, now: float) -> bool:
+        """Whether a client that scrapes at intervals has yet to see that the run ended at `since`."""
+        return self._state != "ended" and now - since < min(2 * self._interval, LONGEST)
+
+
+class _MetricsServer(HTTPServer):
+    def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
+        super().__init__(address, handler)
+        self.scrapes = ScrapeTimes()
+
+    def handle_error(self, *_: object) -> None:
+        """Log nothing when a client disconnects or sends nothing."""
+
+
+def _handler(snapshot: Callable[[], Snapshot]) -> type[BaseHTTPRequestHandler]:
+    from dreamfleet.coordinator.addons.metrics.prometheus import CONTENT_TYPE, exposition  # only where they are served
+
+    class Handler(BaseHTTPRequestHandler):
+        timeout = PATIENCE
+        server_version = "dreamfleet"
+        sys_version = ""
+
+        def handle(self) -> None:
+            """Handle one request; a slow client is cut off, for it would block others and the coordinator's exit."""
+            late = threading.Timer(PATIENCE, self._drop)
+            late.daemon = True
+            late.start()
+            try:
+                super().handle()
+            finally:
+                late.cancel()
+
+        def _drop(self) -> None:
+            with suppress(OSError):  # already closed
+                self.connection.shutdown(socket.SHUT_RDWR)
+
+        def do_GET(self) -> None:  # http.server requires this name
+            if self.path.partition("?")[0] != "/metrics":
+                self.send_error(HTTPStatus.NOT_FOUND, "there is only /metrics")
+                return
+            status = snapshot().full_status()
+            body = exposition(status)
+            self.send_response(HTTPStatus.OK)
+            self.send_header("Content-Type", CONTENT_TYPE)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+            if isinstance(self.server, _MetricsServer):
+                self.server.scrapes.record(status.state, monotonic())
+
+        def log_message(self, *_: object) -> None:
+            """Log no scrape."""
+
+    return Handler

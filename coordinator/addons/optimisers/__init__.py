@@ -1,0 +1,1 @@
+"""Optimisers beside CMA-ES."""

@@ -1,0 +1,1 @@
+"""Looking at runs on disk: list, show, plot, receipt, export, backup, story."""

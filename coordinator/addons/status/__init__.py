@@ -1,0 +1,1 @@
+"""A run's status on a terminal."""

@@ -1,1 +1,0 @@
-"""Finished and live runs compared, plotted, exported and cited."""

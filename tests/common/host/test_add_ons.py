@@ -1,0 +1,42 @@
+from importlib.metadata import EntryPoint, entry_points
+
+import pytest
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.host import add_ons
+from dreamfleet.common.host.add_ons import add_on, find_add_on
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    def register(value):
+        monkeypatch.setattr(add_ons, "entry_points", lambda group: [EntryPoint("card", value, group)])
+
+    return register
+
+
+def test_each_that_is_registered_loads():
+    points = entry_points(group="dreamfleet.addons")
+    assert len(points) >= 6
+    assert all(callable(add_on(point.name)) for point in points)
+
+
+@pytest.mark.parametrize("value", ["dreamfleet.nowhere.card:Card", "dreamfleet.worker.addons.gone:Card"])
+def test_one_whose_folder_is_gone_is_absent(value, registered):
+    registered(value)
+    assert find_add_on("card") is None
+    with pytest.raises(UsageError):
+        add_on("card")
+
+
+def test_one_that_nobody_registered_is_absent():
+    assert find_add_on("nothing of this name") is None
+
+
+def test_a_package_that_one_needs_is_named(registered, tmp_path, monkeypatch):
+    (tmp_path / "needy.py").write_text("import nowhere_at_all\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    registered("needy:Card")
+    with pytest.raises(ModuleNotFoundError) as raised:
+        find_add_on("card")
+    assert raised.value.name == "nowhere_at_all"

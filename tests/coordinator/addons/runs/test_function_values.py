@@ -1,0 +1,108 @@
+"""What people read of a function that is minimised: its own values, where a run has fitness.
+Tests common/protocol/function_values.py and coordinator/addons/dashboard/compared_runs.py."""
+
+import json
+import re
+import sqlite3
+from contextlib import closing
+from dataclasses import replace
+
+import pytest
+
+from dreamfleet.common.addons.analysis.comparison import ComparedRun, are_comparable
+from dreamfleet.common.addons.analysis.learning import LearningCurve
+from dreamfleet.common.artifacts.objective import Objective
+from dreamfleet.common.cli import command_line
+from dreamfleet.common.protocol.function_values import value_of
+from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration, in_values
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.coordinator.addons.dashboard.compared_runs import compare_runs
+from dreamfleet.coordinator.addons.dashboard.stored_runs import describe_run, list_runs
+from dreamfleet.coordinator.addons.runs.plot import fitness_figure, learning_figure
+from dreamfleet.coordinator.addons.status.status_panel import panel_lines
+from tests.support.samples import SPEC, STATUS
+from tests.support.tables import cells
+
+OPTIONS = Objective.of({"dimension": 39, "x0": 0, "minimise": True}).options  # as many as the recorded runs search
+MINIMISED = replace(SPEC, task="function:mine:cost", options=OPTIONS, bundle="", horizon=1, patience=0)
+
+
+@pytest.fixture
+def minimised(runs):
+    """Two runs of a function, whose values fall from 1,000 to 1 in steps of ten."""
+    for name, factor in (("reality", 1.0), ("hidden", 0.5)):
+        with closing(sqlite3.connect(runs / name / "journal.sqlite")) as journal, journal:
+            (text,) = journal.execute("SELECT value FROM run WHERE key = 'settings'").fetchone()
+            settings = json.loads(text)
+            settings["task"] |= {"task": MINIMISED.task, "options": OPTIONS}
+            journal.execute("UPDATE run SET value = ? WHERE key = 'settings'", (json.dumps(settings),))
+            numbers = [each for (each,) in journal.execute("SELECT number FROM generation WHERE mean IS NOT NULL")]
+            for number in numbers:
+                value = factor * 1000.0 / 10 ** (3 * number / (len(numbers) - 1))
+                journal.execute(
+                    "UPDATE generation SET mean = ?, std = ?, best = ?, worst = ? WHERE number = ?",
+                    (-value, value / 4, -value / 2, -2 * value, number),
+                )
+    return runs
+
+
+def test_records_have_the_functions_values_and_others_stay():
+    closed = StoredGeneration(3, -2.0, 0.5, -1.0, -3.0, 0.1, 10, 1.0)
+    found = in_values(closed, MINIMISED)
+    assert (found.mean, found.best, found.worst, found.std) == (2.0, 1.0, 3.0, 0.5)
+    assert in_values(closed, SPEC) is closed
+    assert in_values(None, MINIMISED) is None
+    assert f"{value_of(0.0, MINIMISED):g}" == "0"
+    assert in_values(StoredEvaluation(3, 4, -2.0, 1.0), MINIMISED).mean == 2.0
+
+
+def test_the_plots_fall_on_a_logarithmic_axis_that_says_so(minimised):
+    with open_run(minimised, "reality") as run:
+        figure = fitness_figure(run)
+        if run.evaluations():
+            learning_figure([LearningCurve.of(run)], None)
+    axes = figure.axes[0]
+    assert axes.get_yscale() == "log"
+    mean = axes.lines[0].get_ydata()
+    assert mean[0] == pytest.approx(1000)
+    assert mean[-1] == pytest.approx(1)
+
+
+def test_the_verbs_print_values_and_json_has_fitness(minimised, capsys):
+    words = ["--runs-dir", str(minimised)]
+    assert command_line.main(["runs", "list", *words]) == 0
+    text = {row[0]: row for row in map(cells, capsys.readouterr().out.splitlines())}
+    assert "1.0" in text["reality"]
+    assert command_line.main(["runs", "list", *words, "--json"]) == 0
+    rows = {row["run"]: row for row in json.loads(capsys.readouterr().out)}
+    assert rows["reality"]["mean"] == -1.0
+    assert command_line.main(["runs", "show", "reality", *words]) == 0
+    assert "-1,000" not in capsys.readouterr().out
+    assert command_line.main(["compare", "reality", "hidden", *words]) == 0
+
+
+def test_the_page_has_values_and_the_kind_of_axis(minimised):
+    curves = describe_run(minimised, "reality")["curves"]
+    assert curves["log"]
+    assert curves["mean"][0] == pytest.approx(1000)
+    assert curves["best"][0] == pytest.approx(500)
+    assert next(row for row in list_runs(minimised) if row["run"] == "reality")["mean"] == 1.0
+    assert compare_runs(minimised, "reality", "hidden")["problem"] == ""
+
+
+def test_a_smaller_value_is_the_better_one_of_two_runs(minimised):
+    with open_run(minimised, "reality") as run:
+        side = ComparedRun.of(run)
+    assert side.minimised
+    other = replace(side, settings=replace(side.settings, task=SPEC))
+    assert are_comparable([side, side])
+    assert not are_comparable([side, other])
+
+
+def test_the_panel_says_values():
+    settings = replace(STATUS.settings, task=MINIMISED)
+    closed = [replace(STATUS.last, number=n, mean=-(10.0 ** (3 - n)), best=-0.5, worst=-2000.0) for n in range(4)]
+    status = replace(STATUS, settings=settings, last=closed[-1], recent=tuple(closed))
+    text = " ".join(" ".join(line.plain for line in panel_lines(status, 78)).split())
+    assert re.search(r"\b1\.0.*2,000.*0\.5.*0.*3", text)
+    assert "-2,000" not in text

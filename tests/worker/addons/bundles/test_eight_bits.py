@@ -1,0 +1,211 @@
+"""World models whose encoder and LSTM multiply eight-bit integers.
+Tests worker/worldmodel/eight_bits.py and worker/worldmodel/onnx_graph.py."""
+
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, numpy_helper
+
+from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, ENCODER, write_bundle
+from dreamfleet.common.artifacts.bundle_store import find_bundle, pretrained_folder
+from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.cli.command_line import main
+from dreamfleet.common.errors import BundleError, ControllerError
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.schema.validation import from_plain
+from dreamfleet.worker.addons.bundles.eight_bits import write_eight_bit_bundle
+from dreamfleet.worker.addons.bundles.unbundle import restore_models, unbundle
+from dreamfleet.worker.dream.batch import DreamBatch
+from dreamfleet.worker.worldmodel.eight_bits import PIXEL_STEP, Ranges, add_convolution, round_weights_exactly
+from dreamfleet.worker.worldmodel.export import export_dream
+from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, PolicyStep, open_graph
+from dreamfleet.worker.worldmodel.mdnrnn_config import ATTENTIVE, MDNRNNConfig
+from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
+from tests.support.bundles import write_random_bundle
+
+EYES = VAEConfig(latent=4, channels=(4, 6, 8, 8))
+MEMORY = MDNRNNConfig(latent=4, hidden=6)
+
+
+@pytest.fixture
+def whole(tmp_path):
+    return write_random_bundle(tmp_path / "whole.zip", 3, EYES, MEMORY)
+
+
+@pytest.fixture
+def rounded(whole, tmp_path):
+    return write_eight_bit_bundle(whole, tmp_path / "rounded.zip")
+
+
+def pictures(count):
+    return np.random.default_rng(1).integers(0, 256, (count, 64, 64, 3), np.uint8)
+
+
+def convolve(value, kernel, stride):
+    """Integers (N, C, H, W) with a kernel (O, C, K, K), summed in 64 bits."""
+    size = kernel.shape[-1]
+    windows = np.lib.stride_tricks.sliding_window_view(value, (size, size), axis=(2, 3))[:, :, ::stride, ::stride]
+    return np.einsum("nchwij,ocij->nohw", windows.astype(np.int64), kernel.astype(np.int64))
+
+
+def constants_of(graph, operator, *inputs):
+    """Constants at these inputs of each node of an operator, in the order of the nodes."""
+    graph = onnx.load_model_from_string(graph).graph
+    found = {each.name: numpy_helper.to_array(each) for each in graph.initializer}
+    return [[found[node.input[each]] for each in inputs] for node in graph.node if node.op_type == operator]
+
+
+def test_the_encoder_sums_integers_exactly(whole, rounded):
+    models, seen = restore_models(whole), pictures(3)
+    ranges = from_plain(Ranges, rounded.manifest.models["eight_bits"])
+    value, step = seen.transpose(0, 3, 1, 2).astype(np.int64), PIXEL_STEP
+    for index, (weights, steps) in enumerate(constants_of(rounded.read(ENCODER), "QLinearConv", 3, 4)):
+        kernel, bias = (models.vae[f"encoder.{index * EYES.modules_a_layer}.{part}"] for part in ("weight", "bias"))
+        exact = kernel / steps[:, None, None, None]
+        assert np.abs(weights - exact).max() < 1
+        assert np.abs((weights - exact).sum(axis=(2, 3))).max() <= 0.5 + 1e-4
+        assert np.abs(weights).max() == 63
+        whole_bias = np.rint(bias / (steps.astype(np.float64) * step)).astype(np.int64)
+        total = convolve(value, weights, EYES.down[index].stride) + whole_bias[:, None, None]
+        scale = (steps * np.float32(step) / ranges.step_of(index)).astype(np.float32)
+        value = np.clip(np.rint(total.astype(np.float32) * scale[:, None, None]), 0, 255).astype(np.int64)
+        step = ranges.step_of(index)
+    (large, scale), (small, rest) = constants_of(rounded.read(ENCODER), "MatMulIntegerToFloat", 1, 3)[:2]
+    assert np.abs(large * (scale / step) + small * (rest / step) - models.vae["mu.weight"].T).max() < 2e-5
+    flat = value.reshape(3, -1)
+    expected = (
+        (flat @ large).astype(np.float32) * scale + models.vae["mu.bias"] + (flat @ small).astype(np.float32) * rest
+    )
+    assert np.abs(Encoder(rounded).encode(seen)[0] - expected).max() < 1e-6
+
+
+@pytest.mark.parametrize("centred", [True, False])
+def test_a_sum_of_integers_and_its_scale_have_an_exact_product(centred):
+    kernel, step = np.random.default_rng(1).normal(0, 1, (300, 8)).astype(np.float32), np.float32(0.0123)
+    weights, scale = round_weights_exactly(kernel, step, centred=centred)
+    extremes = np.where(weights > 0, 127 if centred else 255, -128 if centred else 0)
+    assert 32 <= np.abs(weights).max() <= 63
+    for inputs in (extremes, np.random.default_rng(2).permuted(extremes)):
+        sums = (inputs * weights.astype(np.int64)).sum(axis=0)
+        assert (sums.astype(np.float32) == sums).all()
+        assert (sums.astype(np.float32) * scale == sums * scale.astype(np.float64)).all()
+    assert np.abs(weights * (scale / step) - kernel).max() <= (scale / step).max() / 2 * (1 + 1e-6)
+
+
+def test_a_bias_far_above_its_kernel_does_not_overflow():
+    graph, picture = GraphBuilder("convolution"), np.zeros((1, 3, 4, 4), np.uint8)
+    value = graph.add_input("value", TensorProto.UINT8, 3, 4, 4)
+    kernel, bias = np.full((2, 3, 4, 4), 1e-12, np.float32), np.array([0.4, 0.2], np.float32)
+    steps = PIXEL_STEP, np.float32(1 / 255)
+    graph.add_output(add_convolution(graph, value, kernel, bias, steps, {}), "out", TensorProto.UINT8, 2, 1, 1)
+    (found,) = open_graph(graph.build(), 1).run(None, {"value": picture})
+    assert found.ravel().tolist() == [102, 51]
+
+
+def test_a_candidate_whose_actions_are_no_numbers_has_no_fitness(rounded):
+    parameters = np.zeros(rounded.controller_shape.size, np.float32)
+    parameters[::2], parameters[1::2] = 3e38, -3e38
+    batch = DreamBatch(rounded, TaskSpec("dream", rounded.sha256, horizon=5, patience=0))
+    wild, tame = batch.score([(parameters, 1), (np.zeros_like(parameters), 1)])
+    assert not np.isfinite(wild.fitness)
+    assert np.isfinite(tame.fitness)
+
+
+def test_it_sees_and_dreams_nearly_as_before(whole, rounded):
+    seen, rng = pictures(8), np.random.default_rng(2)
+    before, after = (Encoder(each).encode(seen)[0] for each in (whole, rounded))
+    assert np.abs(after - before).max() < 0.05 * np.abs(before).max()
+    action, state = rng.uniform(-1, 1, (8, 3)).astype(np.float32), DreamStep(whole).zero_state(8)
+    kept = [DreamStep(each).advance(before, action, state) for each in (whole, rounded)]
+    assert 0 < np.abs(kept[1] - kept[0]).max() < 0.02
+
+
+@pytest.mark.parametrize("memory", [MEMORY, replace(MEMORY, done=True)])
+def test_a_row_has_the_bits_that_it_has_alone_and_reality_those_of_dreams(tmp_path, memory):
+    rounded = write_eight_bit_bundle(write_random_bundle(tmp_path / "a.zip", 3, EYES, memory), tmp_path / "b.zip")
+    policy, seen = PolicyStep(rounded), pictures(7)
+    parameters = np.random.default_rng(2).normal(0, 1, (7, rounded.controller_shape.size)).astype(np.float32)
+    state = policy.step(seen, parameters, policy.zero_state(7)).state
+    together = policy.step(seen, parameters, state)
+    for row in range(7):
+        alone = policy.step(*(np.ascontiguousarray(each[row : row + 1]) for each in (seen, parameters, state)))
+        assert all((one[0] == all_[row]).all() for one, all_ in zip(alone, together, strict=True))
+    assert (DreamStep(rounded).advance(together.latent, together.action, state) == together.state).all()
+    assert (Encoder(rounded).encode(seen)[0] == together.latent).all()
+
+
+@pytest.mark.parametrize(
+    "memory", [replace(MEMORY, reward="value", previous_reward=True), replace(ATTENTIVE, latent=4, hidden=6, window=3)]
+)
+def test_an_lstm_with_inputs_of_unknown_size_stays_as_it_is(tmp_path, memory):
+    whole = write_random_bundle(tmp_path / "whole.zip", 3, EYES, memory)
+    rounded = write_eight_bit_bundle(whole, tmp_path / "rounded.zip")
+    assert rounded.read(DREAM_GRAPH) == whole.read(DREAM_GRAPH)
+    assert rounded.read(ENCODER) != whole.read(ENCODER)
+
+
+def test_controllers_of_the_whole_world_model_drive_by_the_rounded_one_and_not_the_other_way(whole, rounded):
+    vector = np.zeros(whole.controller_shape.size, np.float32)
+    old, new = (Controller(each.controller_shape, vector, "car-racing", each.sha256) for each in (whole, rounded))
+    assert rounded.for_controller(old).sha256 == rounded.sha256
+    with pytest.raises(ControllerError):
+        whole.for_controller(new)
+
+
+def test_training_resumes_from_what_was_rounded_alone(whole, rounded, tmp_path):
+    with pytest.raises(BundleError, match=whole.sha256[:12]):
+        unbundle(rounded, tmp_path / "data")
+    with pytest.raises(BundleError):
+        write_eight_bit_bundle(rounded, tmp_path / "again.zip")
+
+
+def test_other_activations_are_refused(tmp_path):
+    leaky = write_random_bundle(tmp_path / "a.zip", 3, replace(EYES, activation="leaky_relu"), MEMORY)
+    with pytest.raises(BundleError):
+        write_eight_bit_bundle(leaky, tmp_path / "b.zip")
+    assert not (tmp_path / "b.zip").exists()
+
+
+def test_a_dream_that_loses_its_world_gives_no_ranges(whole, tmp_path):
+    wild = restore_models(whole).mdnrnn
+    numbers = MEMORY.mixtures * MEMORY.latent
+    wild["heads.bias"][-2 * numbers :] = 30  # of means and deviations
+    parts = {name: whole.read(name) for name in whole.manifest.parts} | {DREAM_GRAPH: export_dream(wild, MEMORY)}
+    bundle = write_bundle(tmp_path / "wild.zip", replace(whole.manifest, parts={}), parts)
+    with pytest.raises(BundleError):
+        write_eight_bit_bundle(bundle, tmp_path / "b.zip")
+    assert not (tmp_path / "b.zip").exists()
+
+
+def test_the_rounded_bundle_that_ships_is_tiny():
+    whole, rounded = find_bundle("tiny"), find_bundle("tiny-int8")
+    assert rounded.same_models == (rounded.sha256, whole.sha256)
+    assert from_plain(Ranges, rounded.manifest.models["eight_bits"]).inputs
+    rounded.for_controller(Controller.load(pretrained_folder() / "real.npz"))
+
+
+def test_the_verb_writes_the_same_file_twice(whole, tmp_path):
+    files = [tmp_path / name / "fast.zip" for name in "ab"]
+    for file in files:
+        file.parent.mkdir()
+        assert main(["bundle", "--from", str(whole.path), "--out", str(file)]) == 0
+    assert files[0].read_bytes() == files[1].read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("more", "flag"),
+    [
+        (["--out", "x.zip", "--recorded", "3"], "--recorded"),
+        (["--extract", "tiny"], "--out"),
+        (["--out", "fast.zip", "--recorded", "0"], "--recorded"),
+        (["--out", "fast.zip", "--with-weights"], "--with-weights"),
+    ],
+)
+def test_flags_that_do_not_fit_are_refused(more, flag, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["bundle", "--from", "tiny", *more]) == 2
+    assert flag in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,1 @@
+"""Bundles taken apart, or rounded to eight bits."""

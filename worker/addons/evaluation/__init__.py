@@ -1,0 +1,1 @@
+"""Agents by name, and their scores on unseen episodes."""

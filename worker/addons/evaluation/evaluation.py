@@ -1,0 +1,212 @@
+"""Evaluating agents on unseen seeds, in the environment that their task's reported scores come from."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from statistics import fmean
+from time import perf_counter
+
+from dreamfleet.common.errors import DreamfleetError, StoppedError
+from dreamfleet.common.host.fingerprint import fingerprint
+from dreamfleet.common.host.packages import package_version
+from dreamfleet.common.host.process_pool import count_step, map_in_processes
+from dreamfleet.common.host.resource_limits import pin_thread_pools
+from dreamfleet.common.host.stall_watch import STALL_SECONDS
+from dreamfleet.common.host.unseen_drawing import draw_offscreen, draw_unseen
+from dreamfleet.common.printable import plural
+from dreamfleet.common.protocol.result_bounds import rejection_reason
+from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
+from dreamfleet.common.runs.standard_error import format_with_error, standard_error
+from dreamfleet.worker.addons.evaluation.agents import Agent
+from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
+from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition, score
+from dreamfleet.worker.scoring.failure_cause import crash, failure_of
+from dreamfleet.worker.tasks.api import Score, World
+from dreamfleet.worker.tasks.closing import close_environment
+
+Episode = EpisodeResult | FailedEpisode
+log = logging.getLogger(__name__)
+SPEED, BRAKE = "speed", "brake"  # names in a task's true state, and among a world's actions
+FIRST_LOSSES = 3  # processes lost before any episode has ended, after which the evaluation ends
+
+
+def evaluate(agent: Agent, seeds: tuple[int, ...], jobs: int) -> Iterator[Episode]:
+    """Drive one whole episode for each seed in `jobs` processes, or in this one if it is 1; yield each when it ends.
+
+    An episode that fails does not end the others, and fails again in a fresh process before it counts (R8). In this
+    process, a fresh environment has to do, and an episode that crashes or hangs ends the others.
+    """
+    if jobs > 1:
+        yield from evaluate_in_processes(agent, seeds, jobs)
+        return
+    pin_thread_pools()
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    draw_offscreen()
+    # In this process, so that a script needs no `if __name__ == "__main__"`; Ctrl-C interrupts it.
+    driver = _Driver(agent, (Exception, SystemExit))
+    try:
+        for number, seed in enumerate(seeds):
+            found = driver.drive(seed)
+            yield driver.drive(seed) if number and has_failed(found) else found
+    finally:
+        driver.close()
+
+
+def has_failed(episode: Episode) -> bool:
+    """Whether it has no score."""
+    return isinstance(episode, FailedEpisode)
+
+
+def evaluate_in_processes(
+    agent: Agent, seeds: tuple[int, ...], jobs: int, stall: float = STALL_SECONDS
+) -> Iterator[Episode]:
+    """Like `evaluate`, in `jobs` processes. An episode fails that ends its process, or makes no step for `stall` s.
+
+    `DreamfleetError` if the first processes are all lost before any episode has ended.
+    """
+    lost: list[Episode] = []
+    ended = False
+
+    def lose(seed: int, reason: int | str) -> Episode:
+        error = crash(reason).text
+        lost.append(FailedEpisode(seed, error))
+        if not ended and len(lost) == max(jobs, FIRST_LOSSES):
+            raise DreamfleetError(
+                f"the first {len(lost)} driving processes are lost: {error}; in your own script call this under "
+                '`if __name__ == "__main__":` or with jobs=1; otherwise `dreamfleet doctor` looks for the cause'
+            )
+        return lost[-1]
+
+    pin_thread_pools()
+    # A process has a copy, whose first episode loads the agent: its errors are that episode's. No Ctrl-C raises there.
+    drive = _Driver(agent, (BaseException,)).drive
+    for each in map_in_processes(jobs, draw_unseen, (), drive, seeds, lose, stall, has_failed=has_failed):
+        ended = ended or each not in lost
+        yield each
+
+
+def judge(
+    name: str, agent: Agent, seeds: tuple[int, ...], jobs: int, note: Callable[[str], object] = log.warning
+) -> EvaluationReport:
+    """Drive one whole episode per seed, with a progress bar on stderr; `note` gets a line for each that fails.
+
+    `name` is the agent's in the report. `StoppedError` for a Ctrl-C once an episode has a score: it says the mean of
+    those that have.
+    """
+    from dreamfleet.common.cli.progress import progress_bar
+
+    began, episodes, scores = perf_counter(), list[Episode](), list[float]()
+    with progress_bar("evaluate", len(seeds), "episodes") as bar:
+        try:
+            for each in evaluate_in_processes(agent, seeds, jobs):
+                episodes.append(each)
+                scores += [each.score] if isinstance(each, EpisodeResult) else []
+                bar.update(len(episodes), f"mean {format_with_error(fmean(scores), None)}" if scores else "")
+                if isinstance(each, FailedEpisode):
+                    note(f"an episode failed: {each}")
+        except KeyboardInterrupt:
+            if not scores:
+                raise
+            mean = format_with_error(fmean(scores), standard_error(scores))
+            raise StoppedError(f"interrupted after {len(scores)} of {plural(len(seeds), 'episode')}: {mean}") from None
+    results, world = EpisodeResults.of(episodes), agent.world
+    return EvaluationReport(
+        name, agent.sha256, agent.task, agent.reality, agent.bundle.sha256 if agent.bundle else "",
+        fingerprint(world.packages), package_version("dreamfleet") or "", perf_counter() - began,
+        results.drives, judge=world.judge or agent.reality, threshold=world.threshold, failed=results.failed,
+        marks=tuple(map(float, world.marks)), options=agent.options,
+    )  # fmt: skip
+
+
+class AgentEvaluator:
+    """Drives an agent in its evaluation environment, one episode after another."""
+
+    def __init__(self, agent: Agent) -> None:
+        # First of all, so that nothing else makes one to ask for the world: many simulators allow one a process.
+        self._environment = agent.make_evaluation_environment()
+        try:
+            self._world, self._parameters, self._truth = agent.world, agent.parameters, agent.truth
+            self._policies = agent.make_policies()
+        except BaseException:
+            self.close()
+            raise
+
+    def drive(self, seed: int, on_step: Callable[[int], None] = lambda _steps: None) -> EpisodeResult:
+        """Drive one whole episode; `on_step` gets the number of each step. The statistics do not change its score."""
+        truth, episode_config = self._truth, EpisodeConfig(seed, self._world.horizon)
+        watch = DriveStatistics(self._world, None if truth is None else lambda: truth(self._environment))
+        driven = score(
+            self._environment, self._policies(seed), self._parameters, episode_config, on_step,
+            on_transition=watch.on_transition,
+        )  # fmt: skip
+        return watch.drive(seed, driven)
+
+    def close(self) -> None:
+        """Release the environment."""
+        close_environment(self._environment)
+
+
+class DriveStatistics:
+    """Collects statistics of one episode, as far as its world reports them."""
+
+    def __init__(self, world: World, truth: Callable[[], dict[str, float]] | None) -> None:
+        self._truth, self._finish = truth, world.finish
+        named = truth is not None and BRAKE in world.action_names
+        self._brake = world.action_names.index(BRAKE) if named else None
+        self._speeds: list[float] = []
+        self._braked: list[bool] = []
+        self._finished = False
+
+    def on_transition(self, moment: Transition) -> None:
+        """Add a step."""
+        self._finished = bool(moment.info.get(self._finish, False))
+        true_state = self._truth() if self._truth is not None else {}
+        if SPEED in true_state:
+            self._speeds.append(true_state[SPEED])
+        if self._brake is not None:
+            self._braked.append(bool(moment.action[self._brake] > 0))
+
+    def drive(self, seed: int, score: Score) -> EpisodeResult:
+        """The result of the whole episode."""
+        finished = self._finished if self._finish else None
+        return EpisodeResult(seed, score.fitness, score.steps, finished, _mean(self._speeds), _mean(self._braked))
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return fmean(values) if values else None
+
+
+class _Driver:
+    """Drives episodes; after one that failed it makes policy and environment anew, as they may be broken."""
+
+    def __init__(self, agent: Agent, caught: tuple[type[BaseException], ...]) -> None:
+        self._agent, self._caught = agent, caught
+        self._evaluator: AgentEvaluator | None = None
+
+    def drive(self, seed: int) -> Episode:
+        """Drive one whole episode; a `DreamfleetError` passes through, as it concerns all of them."""
+        try:
+            if self._evaluator is None:
+                self._evaluator = AgentEvaluator(self._agent)
+                count_step()  # it is ready
+            found = self._evaluator.drive(seed, count_step)
+            rejection = rejection_reason(found.score, found.steps, 0.0, found.steps)
+            if rejection is None:
+                return found
+            why = rejection.text
+        except DreamfleetError:
+            raise
+        except self._caught as error:  # a simulator may raise anything
+            why = failure_of(error).text
+        with suppress(*self._caught):
+            self.close()
+        self._evaluator = None
+        return FailedEpisode(seed, why)
+
+    def close(self) -> None:
+        """Release the environment."""
+        if self._evaluator is not None:
+            self._evaluator.close()

@@ -1,0 +1,61 @@
+"""Find whom to evaluate, record or watch: a controller, or a baseline, which has no world model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.files.regular_files import path_exists
+from dreamfleet.common.host.add_ons import add_on, find_add_on
+from dreamfleet.common.runs.lookup import find_agent, find_bundle_of
+
+if TYPE_CHECKING:
+    from dreamfleet.worker.addons.evaluation.agents import Agent
+
+RANDOM, DISCRETE = "random", "random-discrete"
+
+
+def find_driver(
+    name: str,
+    runs_dir: Path,
+    bundle: str | None = None,
+    task: str | None = None,
+    options: Mapping[str, Any] | None = None,
+) -> Agent:
+    """The agent of this name: what `find_agent` finds, a random driver, or the network in its training's folder.
+
+    `bundle` names another world model than the controller's own. `task` and the task's `options` are the world of a
+    random driver, by default the first world. `UsageError` where they do not apply, `DatasetError` for a damaged or
+    foreign checkpoint.
+    """
+    if is_random(name, runs_dir):
+        if bundle is not None:
+            raise UsageError(f"--controller {name} sees nothing: omit --bundle")
+        return make_random_agent(name, task, options or {})
+    if task is not None or options:
+        raise UsageError(
+            f"--task and --environment are the world of --controller {RANDOM}; {name} has a world of its own"
+        )
+    find_network = find_add_on("trained-network")
+    network: Agent | None = find_network(Path(name)) if find_network else None
+    if network is not None:
+        return network
+    from dreamfleet.worker.addons.evaluation.agents import (
+        make_agent,  # heavy, and `baseline train --help` reads this module too
+    )
+
+    controller, beside = find_agent(name, runs_dir)
+    return make_agent(controller, find_bundle_of(controller, bundle, beside))
+
+
+def is_random(name: str, runs_dir: Path) -> bool:
+    """Whether this is the name of a random driver, and of no file and no run."""
+    return name in (RANDOM, DISCRETE) and not (path_exists(Path(name)) or path_exists(runs_dir / name))
+
+
+def make_random_agent(name: str, task: str | None, options: Mapping[str, Any]) -> Agent:
+    """The random driver of this name in a task, by default the first world; `UsageError` if it needs a world model."""
+    agent: Agent = add_on("random-agent")(name, task, options)
+    return agent

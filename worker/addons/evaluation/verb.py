@@ -1,0 +1,144 @@
+"""`dreamfleet evaluate`: a controller on unseen seeds."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dreamfleet.common.artifacts.driving import FIRST_WORLD
+from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
+from dreamfleet.common.cli.key_values import ENVIRONMENT_EXAMPLE, parse_arguments
+from dreamfleet.common.cli.output import print_next
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.files.atomic_write import check_output_path, open_output
+from dreamfleet.common.host.resource_limits import pin_thread_pools, usable_cores
+from dreamfleet.common.runs.seeds import TEST
+
+if TYPE_CHECKING:
+    from dreamfleet.worker.addons.evaluation.agents import Agent
+
+SUMMARY = "judge a controller on unseen seeds, in whole episodes of the world itself"
+EXTRAS = ("worker",)
+FIRST = "--controller --run --task --connect --episodes --first-seed --bundle --jobs --out --json"
+ELSEWHERE = {"--tracks": "give --episodes N, the number of tracks"}
+CONTROLLER = (
+    "who drives: the file of a controller or agent, a training's folder, a run, one that ships, or random: uniform "
+    "random actions in --task (random-discrete: the default world's five)"
+)
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("--controller", help=CONTROLLER)
+    add_random_flags(parser)
+    parser.add_argument(
+        "--run", dest="run_name", metavar="RUN", help="judge this live run's reported controller instead"
+    )
+    add_global_flags(
+        parser, "connect", texts={"connect": "ask the live run here (give --run too where there are several)"}
+    )
+    parser.add_argument("--episodes", type=int, default=100, help="whole episodes, one per seed (default 100)")
+    parser.add_argument("--first-seed", type=int, default=TEST.start, help=f"the first seed (default {TEST.start})")
+    parser.add_argument(
+        "--cell",
+        help="judge the elite of this cell of the run's archive: its numbers, such as 3,7, or MEASURE=VALUE,...",
+    )
+    parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
+    parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one per core)")
+    add_global_flags(parser, "runs_dir")
+    parser.add_argument("--json", action="store_true", help="print every figure and drive as JSON")
+    parser.add_argument("--out", type=Path, help="also write that JSON to this file, for `compare` and `verify report`")
+
+
+def add_random_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of the world in which random actions are drawn."""
+    parser.add_argument(
+        "--task", metavar="TASK",
+        help=f"of --controller random: the world, a task without a world model, such as gym:ENVIRONMENT (default "
+        f"{FIRST_WORLD})",
+    )  # fmt: skip
+    parser.add_argument(
+        "--environment", nargs="+", default=[], metavar="KEY=VALUE",
+        help="of --controller random: arguments of its task, as a run's --environment",
+    )  # fmt: skip
+
+
+def named_agent(args: argparse.Namespace) -> Agent:
+    """The agent of `--controller`; a note on stderr names the world of random actions."""
+    from dreamfleet.worker.addons.evaluation.named_agents import find_driver, is_random
+
+    arguments = parse_arguments("--environment", args.environment, ENVIRONMENT_EXAMPLE)
+    options = {"environment": arguments} if arguments else {}
+    agent = find_driver(args.controller, args.runs_dir, args.bundle, args.task, options)
+    if is_random(args.controller, args.runs_dir):
+        remedy = "" if args.task else "; --task names another world"
+        print(f"{args.controller} actions in {agent.reality}{remedy}", file=sys.stderr)
+    return agent
+
+
+def agent_flags(args: argparse.Namespace) -> tuple[object, ...]:
+    """The flags of the same agent for `evaluate` and `record`."""
+    runs_dir = args.runs_dir if "runs_dir" in getattr(args, "given", ()) else None
+    values = {"controller": args.controller, "bundle": args.bundle, "task": args.task, "runs-dir": runs_dir}
+    found = (word for name, value in values.items() if value is not None for word in (f"--{name}", value))
+    return (*found, *(("--environment", *args.environment) if args.environment else ()))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Drive, and print the scores."""
+    pin_thread_pools()  # of NumPy, which is not loaded yet: its threads take three times the time of a drive otherwise
+    from dreamfleet.worker.addons.evaluation.evaluation import judge
+    from dreamfleet.worker.addons.evaluation.evaluation_report import check_seed_range
+
+    if args.episodes < 1 or args.first_seed < 0 or args.jobs < 1:
+        raise UsageError("--episodes and --jobs must be at least 1, --first-seed at least 0")
+    check_seed_range(args.first_seed, args.episodes)
+    if args.out:
+        check_output_path(args.out)
+    name, agent = _choose_agent(args)
+    seeds = tuple(range(args.first_seed, args.first_seed + args.episodes))
+    note = partial(print, file=sys.stderr)
+    if seeds[0] not in TEST or seeds[-1] not in TEST:
+        some = "some" if seeds[0] < TEST.stop and seeds[-1] >= TEST.start else "none"
+        note(f"note: test seeds are {TEST.start} to {TEST.stop - 1}; {some} of these are among them")
+    judgement = judge(name, agent, seeds, args.jobs, note)
+    print(judgement.to_json() if args.json else judgement.describe(agent.world.score_word), flush=True)
+    if args.out:
+        with open_output(args.out) as file:
+            file.write(f"{judgement.to_json()}\n".encode())
+    if args.controller and args.cell is None:  # a live run's controller, and a cell's, are no file here
+        print_next(args, ("record", *agent_flags(args)))
+    return 0
+
+
+def _choose_agent(args: argparse.Namespace) -> tuple[str, Agent]:
+    """The name and controller to judge: from this disk, or from a live run."""
+    from dreamfleet.common.addons.analysis.elites import find_elite
+    from dreamfleet.common.client.client import Client
+    from dreamfleet.common.runs.lookup import find_bundle_of
+    from dreamfleet.worker.addons.evaluation.agents import make_agent
+    from dreamfleet.worker.service.bundle_fetch import fetch_bundle_of
+
+    live = bool(args.run_name) or bool({"connect", "join"} & args.given)
+    if live and not args.controller:
+        if args.task or args.environment:
+            raise UsageError("--task and --environment are the world of --controller random: a live run has its own")
+        with Client(resolve_network(args)) as client:
+            run = args.run_name or client.status().run
+            reported = client.controller(run)
+            if args.bundle is None:
+                return run, make_agent(reported, fetch_bundle_of(reported, client.session, run))
+        return run, make_agent(reported, find_bundle_of(reported, args.bundle))
+    if live or not args.controller:
+        raise UsageError("give either --controller, or --run (and --connect) to judge what a live run reports")
+    if args.cell is not None:
+        if args.task or args.environment:
+            raise UsageError("--task and --environment are the world of --controller random: a cell's run has its own")
+        controller, beside, found = find_elite(args.runs_dir, args.controller, args.cell)
+        name = f"{args.controller}, cell {args.cell}"
+        print(f"{args.controller}, {found}, as the run measured it", file=sys.stderr)
+        return name, make_agent(controller, find_bundle_of(controller, args.bundle, beside))
+    return args.controller, named_agent(args)

@@ -1,0 +1,25 @@
+"""The worker's own checks for `dreamfleet doctor`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from dreamfleet.common.addons.doctor.health import Finding
+
+
+def examine() -> Iterator[Finding]:
+    """Check that the native renderer was built and draws the same pictures as the installed gymnasium."""
+    remedy = "install a C compiler, then pip install --force-reinstall --no-deps dreamfleet; gymnasium draws until then"
+    try:
+        from dreamfleet.worker.worlds.car_racing.environment import is_native_available
+        from dreamfleet.worker.worlds.car_racing.native_check import native_is_exact
+    except ModuleNotFoundError as error:
+        yield Finding("native picture", False, False, f"no {error.name}", "worker", "pip install 'dreamfleet[worker]'")
+        return
+    if not is_native_available():
+        yield Finding("native picture", False, False, "not built", "worker", remedy)
+    elif not native_is_exact():
+        remedy = "install the tested versions of gymnasium and pygame-ce; gymnasium draws until then"
+        yield Finding("native picture", False, False, "differs from gymnasium's", "worker", remedy)
+    else:
+        yield Finding("native picture", True, False, "equal to gymnasium's", "worker", "")

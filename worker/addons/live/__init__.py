@@ -1,0 +1,1 @@
+"""Drives and dreams in a window while they happen."""

@@ -1,0 +1,1 @@
+"""World models adjusted after their training: subspaces, refits."""

@@ -1,0 +1,1 @@
+"""Scores driven again: a candidate of a run, a report."""

@@ -1,0 +1,96 @@
+"""`dreamfleet verify report`: check recorded scores."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dreamfleet.common.cli.global_config import add_global_flags
+from dreamfleet.common.cli.output import add_json_flag, print_answer
+from dreamfleet.common.errors import BundleError, ControllerError, UsageError
+from dreamfleet.common.host.resource_limits import pin_thread_pools, usable_cores
+
+if TYPE_CHECKING:
+    from dreamfleet.worker.addons.evaluation.agents import Agent
+    from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
+    from dreamfleet.worker.addons.verification.reproduction import Reproduction
+
+SUMMARY = "drive recorded controllers again on their recorded seeds, and compare with what `evaluate --out` wrote"
+EXTRAS = ("worker",)
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("reports", metavar="REPORT", nargs="+", type=Path, help="files of `evaluate --out`")
+    parser.add_argument("--episodes", type=int, help="only this many seeds of each, the first ones (default all)")
+    parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
+    parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one per core)")
+    add_global_flags(parser, "runs_dir")
+    add_json_flag(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Check each report; exit 1 if a score differs."""
+    pin_thread_pools()  # of NumPy, which is not loaded yet
+    from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
+
+    if args.jobs < 1 or (args.episodes is not None and args.episodes < 1):
+        raise UsageError("--episodes and --jobs must be at least 1")
+    found = [
+        _reproduce(args, path, recorded)
+        for path, recorded in [(each, read_evaluation_report(each)) for each in args.reports]
+    ]
+    rows = [{"report": path, **_row(each)} for path, each in zip(args.reports, found, strict=True)]
+    holds = all(each.is_reproduced for each in found)
+    print_answer(args, "\n".join(each.description for each in found), reproduced=holds, reports=rows)
+    return 0 if holds else 1
+
+
+def _reproduce(args: argparse.Namespace, path: Path, recorded: EvaluationReport) -> Reproduction:
+    """Drive one report's controller again."""
+    from dreamfleet.worker.addons.evaluation.evaluation import judge
+    from dreamfleet.worker.addons.verification.reproduction import Reproduction
+
+    agent = _find_recorded_agent(args, path, recorded)
+    seeds, note = recorded.results.seeds[: args.episodes], partial(print, file=sys.stderr)
+    again = judge(recorded.name, agent, seeds, args.jobs, note)
+    return Reproduction(recorded, again)
+
+
+def _find_recorded_agent(args: argparse.Namespace, path: Path, recorded: EvaluationReport) -> Agent:
+    from dreamfleet.common.runs.lookup import find_agent, find_bundle_of
+    from dreamfleet.worker.addons.evaluation.agents import make_agent
+    from dreamfleet.worker.addons.evaluation.named_agents import is_random, make_random_agent
+
+    if is_random(recorded.name, args.runs_dir):
+        return make_random_agent(recorded.name, recorded.task, json.loads(recorded.options or "{}"))
+    controller, beside = find_agent(recorded.name, args.runs_dir)
+    if controller.sha256 != recorded.controller:
+        raise ControllerError(
+            f"{path} records the controller {recorded.controller[:12]}, and {recorded.name} is "
+            f"{controller.sha256[:12]}: take the one that was recorded, or record this one with `dreamfleet evaluate`"
+        )
+    bundle = find_bundle_of(controller, args.bundle, beside)
+    if bundle is not None and bundle.sha256 != recorded.bundle:
+        raise BundleError(
+            f"{path} records drives by the world model {recorded.bundle[:12] or 'of none'}, and this is "
+            f"{bundle.sha256[:12]}: give that one by --bundle"
+        )
+    return make_agent(controller, bundle)
+
+
+def _row(found: Reproduction) -> dict[str, object]:
+    difference = asdict(found.difference) if len(found.pairs) > 1 else None
+    return {
+        "name": found.recorded.name,
+        "reproduced": found.is_reproduced,
+        "same_host": found.same_fingerprint,
+        "differing": found.differing_seeds,
+        "mean": found.repeated.results.mean,
+        "difference": difference,
+    }

@@ -1,0 +1,82 @@
+"""Comparison of recorded scores with those of the same episodes repeated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from dreamfleet.common.printable import format_number, plural
+from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
+from dreamfleet.common.runs.paired_difference import PairedDifference
+from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """A recorded report, and a new one of the same controller on all or some of its seeds.
+
+    On a host of the recorded fingerprint every episode must be bit-identical. On other hosts the mean may differ by two
+    standard errors of the paired difference; a single episode must be bit-identical there too.
+    """
+
+    recorded: EvaluationReport
+    repeated: EvaluationReport
+
+    @cached_property
+    def pairs(self) -> tuple[tuple[EpisodeResult, EpisodeResult], ...]:
+        """Each repeated episode with its record, which comes first."""
+        before = {each.seed: each for each in self.recorded.drives}
+        return tuple((before[each.seed], each) for each in self.repeated.drives)
+
+    @property
+    def same_fingerprint(self) -> bool:
+        """Whether the hosts' fingerprints are equal, so that equal bits are expected."""
+        return self.recorded.fingerprint == self.repeated.fingerprint
+
+    @property
+    def differing_seeds(self) -> tuple[int, ...]:
+        """The seeds whose score or number of steps differs, or which fail now."""
+        differing = {one.seed for one, other in self.pairs if (one.score, one.steps) != (other.score, other.steps)}
+        return tuple(sorted(differing | {each.seed for each in self.repeated.failed}))
+
+    @property
+    def difference(self) -> PairedDifference:
+        """The new scores minus the recorded ones; `UsageError` for a single seed."""
+        return PairedDifference.between(EpisodeResults(tuple(one for one, _ in self.pairs)), self.repeated.results)
+
+    @property
+    def is_reproduced(self) -> bool:
+        """Whether the record is reproduced."""
+        return not self.differing_seeds or (
+            not self.repeated.failed
+            and not self.same_fingerprint
+            and len(self.pairs) > 1
+            and not self.difference.is_significant
+        )
+
+    @property
+    def description(self) -> str:
+        """A text for display."""
+        name, count, mean = self.recorded.name, len(self.pairs), self.repeated.results.mean
+        failed = len(self.recorded.failed)
+        if self.repeated.failed:
+            now = self.repeated.results.failure_text
+            return f"{name}: NOT reproduced: {now}; all had a score when they were recorded"
+        if not self.differing_seeds:
+            host = "" if self.same_fingerprint else ", although this host has another fingerprint"
+            left = f"; {plural(failed, 'episode')} that had failed: not driven again" if failed else ""
+            return f"{name}: reproduced: {plural(count, 'bit-identical score')}, mean {format_number(mean)}{host}{left}"
+        if self.same_fingerprint:
+            seeds = ", ".join(map(str, self.differing_seeds[:5])) + (", ..." if len(self.differing_seeds) > 5 else "")
+            return (
+                f"{name}: NOT reproduced: {len(self.differing_seeds)} of {plural(count, 'drive')} differ (seeds "
+                f"{seeds}) on a "
+                f"host of the recorded fingerprint; it was recorded by dreamfleet {self.recorded.version}, here is "
+                f"{self.repeated.version}"
+            )
+        hosts = f"recorded on [{self.recorded.fingerprint}], this host is [{self.repeated.fingerprint}]"
+        if count < 2:
+            was = f"{format_number(mean)} instead of {format_number(self.pairs[0][0].score)}"
+            return f"{name}: NOT reproduced: {was} on one seed; without equal bits a comparison takes 2 seeds; {hosts}"
+        verdict = "reproduced" if self.is_reproduced else "NOT reproduced"
+        return f"{name}: {verdict}: mean {format_number(mean)}, {self.difference.description}; {hosts}"

@@ -1,1 +1,0 @@
-"""Tools for people: evaluate, record, watch and replay a controller."""
