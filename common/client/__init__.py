@@ -1,1 +1,3 @@
-"""Asking live runs from any host: status, batches, frames, and what follows from them."""
+"""Asking live runs from any host: status, and what follows from it."""
+
+__all__ = ["client", "status", "run_view", "eta", "equal_fitness", "elites"]

@@ -21,8 +21,8 @@ from dreamfleet.common.client.status import (
     read_document,
     read_status,
 )
-from dreamfleet.common.client.status_card import show_live
 from dreamfleet.common.errors import ConnectionFailedError, ControllerError, DreamfleetError, RefusedError, UsageError
+from dreamfleet.common.host.add_ons import add_on
 from dreamfleet.common.printable import join_some
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import decode_json
@@ -116,7 +116,7 @@ class Client(Displayed):
 
         Interrupting the cell ends the showing and not the run. Outside of a notebook, a line of each status is printed.
         """
-        show_live(self.watch(run, pause, patience))
+        add_on("show-live")(self.watch(run, pause, patience))
 
     def watch_documents(self, run: str, pause: float, patience: float = PATIENCE) -> Iterator[dict[str, Any]]:
         """Like `watch`, but yields raw statuses."""

@@ -69,7 +69,8 @@ class Eta:
         if self.pace is not None and parts != [DONE]:
             parts.append(f"{format_duration(self.pace)} a generation")
         if self.rest:
-            left = ", ".join(each.description for each in self.rest)
+            one = len(self.rest) == 1 and self.seconds is not None  # its seconds are the whole
+            left = self.rest[0].name if one else ", ".join(each.description for each in self.rest)
             named = f": {left}" if [each.name for each in self.rest] != [SEARCH] else ""
             about = f"about {format_duration(self.seconds)} to go" if self.seconds else "about to end"
             parts.append(f"to go{named}" if self.seconds is None else f"{about}{named}")

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from dreamfleet.common.client.equal_fitness import describe_equal_fitness
+from dreamfleet.common.host.add_ons import find_add_on
 from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.protocol.check_counts import CheckCounts
 from dreamfleet.common.protocol.failures import describe_job
@@ -336,10 +337,9 @@ class Status(Displayed):
         return view.headline, view.facts
 
     def _repr_html_(self) -> str:
-        """The card that notebooks show."""
-        from dreamfleet.common.client.status_card import status_card
-
-        return status_card(self)
+        """The card that notebooks show, where the add-on for it is installed."""
+        card = find_add_on("status-card")
+        return str(card(self)) if card else super()._repr_html_()
 
     @property
     def is_over(self) -> bool:

@@ -1,1 +1,17 @@
 """The Zenoh protocol: keys, messages, their encoding and their bounds."""
+
+__all__ = [
+    "keys",
+    "messages",
+    "codec",
+    "tasks",
+    "batches",
+    "measures",
+    "host_classes",
+    "result_bounds",
+    "failures",
+    "stop_kind",
+    "check_counts",
+    "frame_pictures",
+    "function_values",
+]

@@ -1,1 +1,17 @@
 """Runs on disk: their journals as typed records, schedules, provenance and evaluation reports."""
+
+__all__ = [
+    "run_folder",
+    "run_paths",
+    "records",
+    "stages",
+    "seeds",
+    "episode_results",
+    "standard_error",
+    "paired_difference",
+    "effort",
+    "run_provenance",
+    "lookup",
+    "own_runs",
+    "run_lock",
+]

@@ -1,1 +1,3 @@
 """Zenoh sessions, endpoints, queries and the router."""
+
+__all__ = ["session", "query", "network"]

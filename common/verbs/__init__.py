@@ -1,1 +1,3 @@
 """Command-line verbs; import-light, so that `dreamfleet --help` needs no extra."""
+
+__all__ = ["control"]

@@ -1,1 +1,3 @@
 """Which worker gets which job: leases, credit, lost workers, speculative copies. Pure."""
+
+__all__ = ["fleet", "member", "pending_jobs", "packing", "host_stats", "failures", "refusals", "event_log"]

@@ -1,1 +1,12 @@
 """What a run scores: generations, evaluations, confirmations and kept rollouts, as jobs. Pure."""
+
+__all__ = [
+    "work",
+    "generation",
+    "evaluation",
+    "confirmation",
+    "checks",
+    "rollout_collection",
+    "upload_assembler",
+    "history",
+]

@@ -1,1 +1,3 @@
 """The coordinator on Zenoh: name lock, inbound queue, status, metrics."""
+
+__all__ = ["main", "snapshot"]

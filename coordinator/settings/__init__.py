@@ -1,1 +1,16 @@
 """What a run is: settings, presets, schedule, starting point, how it is resumed or rerun."""
+
+__all__ = [
+    "config",
+    "presets",
+    "network",
+    "limits",
+    "live_log",
+    "schedule",
+    "start",
+    "freezing",
+    "fork",
+    "resume_settings",
+    "run_setup",
+    "run_provenance",
+]

@@ -1,1 +1,11 @@
 """The run's journal, its backup, and a watch over its files."""
+
+__all__ = [
+    "journal",
+    "journal_file",
+    "batch_records",
+    "verification_records",
+    "served_bundle",
+    "kept_revocations",
+    "file_watch",
+]

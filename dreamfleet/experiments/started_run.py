@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any, Self, Unpack
 from weakref import finalize
 
+from dreamfleet.common.addons.status_card import show_live
 from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.cli.parser import Parser
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.client.status import Status
-from dreamfleet.common.client.status_card import show_live
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
 from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
 from dreamfleet.common.files.locks import open_lock, try_lock

@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import gymnasium
 
+__all__ = ["task", "world", "batch", "environment", "noise"]
+
 ENVIRONMENT, CAR_RACING_ENVIRONMENT = "dreamfleet/Dream-v0", "dreamfleet/CarRacingDream-v0"
 
 for _name in (ENVIRONMENT, CAR_RACING_ENVIRONMENT):

@@ -1,1 +1,17 @@
 """Tasks: the contract between an environment, a policy and the rest of the system, and finding tasks by name."""
+
+__all__ = [
+    "api",
+    "registry",
+    "policy",
+    "pictures",
+    "measures",
+    "recordable",
+    "reset",
+    "closing",
+    "batches",
+    "side_by_side",
+    "watching",
+    "true_state",
+    "drivers",
+]

@@ -1,1 +1,13 @@
 """From nothing to a bundle: collect, train the VAE, encode, train the MDN-RNN, bundle."""
+
+__all__ = [
+    "presets",
+    "config_flags",
+    "train_vae",
+    "encode",
+    "train_mdnrnn",
+    "training_state",
+    "checkpoint",
+    "assemble",
+    "torch_setup",
+]

@@ -5,3 +5,19 @@ import os
 # ONNX Runtime reads it when it is first imported, which only modules of this package do. By default it would keep an
 # identifier in the user's cache folder, and report each process to its maker.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+
+__all__ = [
+    "vae_config",
+    "vae",
+    "mdnrnn_config",
+    "mdnrnn",
+    "inference",
+    "policy",
+    "recurrent_state",
+    "choice_memory",
+    "observation",
+    "export",
+    "mdnrnn_graph",
+    "onnx_graph",
+    "eight_bits",
+]

@@ -1,1 +1,3 @@
 """Join files: an authority issues, lists and revokes them."""
+
+__all__ = ["verb"]

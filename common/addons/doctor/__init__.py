@@ -1,1 +1,3 @@
 """What a host can do: checks of `dreamfleet doctor`."""
+
+__all__ = ["verb", "health"]

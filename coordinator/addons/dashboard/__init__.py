@@ -1,1 +1,3 @@
 """A read-only web page about live runs, over Zenoh, and past ones, from their journals on this disk."""
+
+__all__ = ["verb"]

@@ -1,1 +1,3 @@
 """A run's metrics for Prometheus."""
+
+__all__ = ["metrics_server", "prometheus"]

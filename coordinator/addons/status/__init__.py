@@ -1,1 +1,3 @@
 """A run's status on a terminal."""
+
+__all__ = ["verb", "status_panel"]

@@ -1,1 +1,3 @@
 """One small web server for add-ons: its address, limits, guard and streams of events."""
+
+__all__ = ["server", "address", "documents", "guard"]

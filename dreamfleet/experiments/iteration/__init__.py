@@ -3,3 +3,5 @@
 Pure: `config`, `plan`, `layout`, `requests`, `gate`, `summary`. `ledger` and `artefacts` read and write files, `phases`
 does one phase, `runner` goes from one to the next.
 """
+
+__all__ = ["runner", "phases", "summary", "ledger", "plan", "config", "layout"]

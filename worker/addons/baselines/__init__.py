@@ -1,1 +1,3 @@
 """What controllers are measured against: random drivers, and a network that learns without a world model."""
+
+__all__ = ["verb", "agents"]

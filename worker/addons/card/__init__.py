@@ -1,1 +1,3 @@
 """A controller as a folder to publish."""
+
+__all__ = ["verb"]

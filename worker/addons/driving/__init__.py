@@ -1,1 +1,3 @@
 """Driving by hand, on the track or in the dream."""
+
+__all__ = ["verb", "picture_window"]

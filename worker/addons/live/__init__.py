@@ -1,1 +1,3 @@
 """Drives and dreams in a window while they happen."""
+
+__all__ = ["verb"]

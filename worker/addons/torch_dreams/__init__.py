@@ -1,1 +1,3 @@
 """Dreams on a torch device."""
+
+__all__ = ["torch_batch"]

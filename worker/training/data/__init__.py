@@ -1,1 +1,3 @@
 """A data set of recorded drives: collected, stored, read."""
+
+__all__ = ["dataset", "data_folder", "collect_config", "collect", "pilot", "rollouts", "drive_steps", "recorded_states"]

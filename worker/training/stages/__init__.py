@@ -3,6 +3,8 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
+__all__ = ["StageReport", "collect", "train", "encode", "bundle"]
+
 
 @dataclass(frozen=True)
 class StageReport:

@@ -12,6 +12,8 @@ import gymnasium
 
 from dreamfleet.common.host.packages import allow_swig_types
 
+__all__ = ["task", "agents", "environment", "preprocessing", "native_check"]
+
 ENVIRONMENT = "dreamfleet/CarRacing-v3"
 LATENT = "dreamfleet/CarRacingLatent-v0"
 

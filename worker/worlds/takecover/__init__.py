@@ -1,1 +1,3 @@
 """ViZDoom's Take Cover: a player who can only step aside lives as long as no fireball hits."""
+
+__all__ = ["task"]

@@ -7,7 +7,7 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-from dreamfleet.common.client.status_card import MOST_WORKERS, fitness_chart, show_live
+from dreamfleet.common.addons.status_card import MOST_WORKERS, fitness_chart, show_live
 from tests.support.large_status import LARGE
 from tests.support.processes import DEADLINE, ROOT
 from tests.support.samples import STATUS
