@@ -153,6 +153,9 @@ messages:  ## tests/golden/messages.txt: every message of the product, as it sta
 keyed: $(VENV)/.dev  ## the tests with a key in place of each message: one that fails reads a sentence. ARGS='tests/common'
 	PYTHONPATH=$(CURDIR)/tests/support/keyed $(BIN)/pytest -m "not slow and not long and not wording" --numprocesses 3 --dist worksteal $(ARGS)
 
+core: $(VENV)/.dev  ## the core's tests in a copy without any add-on
+	$(PYTHON) deploy/core.py $(ARGS)
+
 structure:  ## figures of the structure: rooms, floors, imports between rooms, files a folder, class names, wording
 	$(PYTHON) deploy/structure.py $(ARGS)
 

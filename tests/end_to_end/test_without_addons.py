@@ -1,9 +1,10 @@
-"""The core is whole without its add-ons: a tree that lacks both folders evolves, shows and judges a controller."""
+"""The core is whole without its add-ons: a tree that lacks their folders evolves and judges a controller."""
 
 import shutil
 
 import pytest
 
+from dreamfleet.common.runs.run_folder import open_run
 from tests.support.processes import ROOT
 
 LEFT_OUT = shutil.ignore_patterns("addons", "__pycache__", "docs", "deploy")
@@ -20,9 +21,6 @@ def test_a_run_needs_no_add_on(tmp_path, processes):
     gone = processes.start("inspect", "--help", root=tree)
     assert [each.finish()[0] for each in (coordinator, worker)] == [0, 0]
     assert gone.finish()[0] == 1  # so it is that tree which runs
-    place = ("--runs-dir", processes.runs)
-    shown = [
-        processes.start("runs", "show", "test", *place, root=tree),
-        processes.start("evaluate", "--controller", "test", "--episodes", 1, "--jobs", 1, *place, root=tree),
-    ]
-    assert [each.finish()[0] for each in shown] == [0, 0]
+    with open_run(processes.runs, "test") as run:
+        assert len(run.history()) == 2
+        assert run.confirmation().episodes == 2
