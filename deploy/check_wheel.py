@@ -28,6 +28,7 @@ EXPECTED = (
     "dreamfleet/coordinator/service/service.py",
     "dreamfleet/worker/service/worker.py",
 )
+BESIDE = ("docs", "deploy")  # the package, in a checkout and an sdist
 HOSTILE = ("worker.py", "coordinator.py", "common/__init__.py", "tasks.py")
 LINK = re.compile(r"\]\((?![a-z]+:|#)([^)\s#]+)")  # without its anchor
 FENCED = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
@@ -42,16 +43,13 @@ def main() -> int:
         folder = Path(name)
         run(sys.executable, "-m", "build", "--outdir", str(folder), str(ROOT))
         (wheel,), (sdist,) = folder.glob("*.whl"), folder.glob("*.tar.gz")
-        for kind, files in (
-            ("wheel", files_of(wheel)),
-            ("sdist", [each.partition("/")[2] for each in files_of(sdist)]),
+        for kind, files, known in (
+            ("wheel", files_of(wheel), {"dreamfleet"}),
+            ("sdist", [each.partition("/")[2] for each in files_of(sdist)], {"dreamfleet", "setup.py", *BESIDE}),
         ):
-            if missing := [name for name in EXPECTED if name not in files]:
+            if missing := [name for name in EXPECTED if name not in files and name.partition("/")[2] not in files]:
                 return complain(f"the {kind} lacks {', '.join(missing)}")
-            if strange := {file.partition("/")[0] for file in files if file.endswith(".py")} - {
-                "dreamfleet",
-                "setup.py",
-            }:
+            if strange := {file.partition("/")[0] for file in files if file.endswith(".py")} - known:
                 return complain(f"the {kind} holds modules of {', '.join(sorted(strange))}")
         hostile = folder / "hostile"
         for file in HOSTILE:

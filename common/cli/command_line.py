@@ -211,8 +211,10 @@ class _Overview(argparse.ArgumentParser):
         from dreamfleet.common.cli.overview import overview
 
         text = overview(DESCRIPTION, EXIT_CODES, self._points, lambda name: _summary(self._points[name]))
-        page = Path(str(files("dreamfleet"))) / "docs" / "index.md"
-        return f"{text}\nDocuments\n  {page}\n" if page.exists() else text
+        package = Path(str(files("dreamfleet")))
+        pages = [folder / "docs" / "index.md" for folder in (package, package.parent)]  # of a wheel, of a checkout
+        page = next((each for each in pages if each.exists()), None)
+        return f"{text}\nDocuments\n  {page}\n" if page else text
 
 
 def _help_parser(prog: str, names: Iterable[str], points: Mapping[str, EntryPoint]) -> argparse.ArgumentParser:

@@ -7,7 +7,7 @@ import pytest
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support.processes import ROOT
 
-LEFT_OUT = shutil.ignore_patterns("addons", "__pycache__", "docs", "deploy")
+LEFT_OUT = shutil.ignore_patterns("addons", "__pycache__")
 
 
 @pytest.mark.slow
