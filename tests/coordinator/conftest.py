@@ -15,3 +15,17 @@ def runs(tmp_path):
         shutil.copytree(FIXTURES / "runs" / name, tmp_path / "runs" / name)
         shutil.copyfile(FIXTURES / "small.zip", tmp_path / "runs" / name / "bundle.zip")
     return tmp_path / "runs"
+
+
+@pytest.fixture
+def make_bench(tmp_path, random_bundle):
+    """Makes benches of a kind, each in a folder of its own; their journals are closed with the test."""
+    made = []
+
+    def make(kind, *given, **options):
+        made.append(kind(tmp_path / "runs" / f"night-{len(made)}", random_bundle.path, *given, **options))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.journal.close()

@@ -58,10 +58,11 @@ def test_a_rule_that_is_forgotten_is_missed(name):
     assert not broken, "the mutant itself is broken"
 
 
-def test_a_schedule_is_played_the_same_every_time():
+def test_a_schedule_is_played_the_same_every_time_and_breaks_no_rule():
     for number in range(20):
         first, again = play(draw(1, number)), play(draw(1, number))
         assert (first.now, first.events, first.scored) == (again.now, again.events, again.scored)
+        assert first.violation is None
 
 
 @pytest.mark.slow

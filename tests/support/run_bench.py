@@ -66,6 +66,11 @@ class Bench:
         self.journal = Journal(self.path / "journal.sqlite")
         self.begin()
 
+    def wait(self, seconds=1.0):
+        """Let time pass."""
+        self.now += seconds
+        self.run.tick(self.now)
+
     def handle_heartbeat(self, name, unacked=(), host_class=""):
         if (member := self.run.fleet.members.get(name)) is None:
             return

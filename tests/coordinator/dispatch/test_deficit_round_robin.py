@@ -2,23 +2,24 @@
 
 import heapq
 
-import numpy as np
 import pytest
+from msgspec.structs import replace
 
-from dreamfleet.common.protocol.messages import TAG_BYTES, Heartbeat, Result, RunningJob
+from dreamfleet.common.protocol.messages import Result
 from dreamfleet.coordinator.dispatch.deficit_round_robin import OUTLIER, DeficitCounter
-from dreamfleet.coordinator.dispatch.fleet import Fleet
-from dreamfleet.coordinator.jobs.work import make_work, vector_bytes
-from tests.support.dispatched import A, B, fleet_of, join
-from tests.support.samples import HEAD, SPEC
+from tests.support.dispatched import A, B, Fleet, beat, fleet_of, join, work
 
 
 class Simulated:
-    """Workers of so many slots that do jobs in order; a job takes its kind's seconds, a generation its jobs."""
+    """Workers of so many slots that do jobs in order; a job takes its kind's seconds, a generation its jobs.
 
-    def __init__(self, workers, slots, jobs, seconds, width=1, **how):
+    As a generation opens, `evaluations` says how many episodes of an evaluation begin.
+    """
+
+    def __init__(self, workers, slots, jobs, seconds, width=1, evaluations=lambda generation: 0, **how):
         self.fleet = Fleet(1.0, **how)
         self.slots, self.jobs, self.seconds, self.width = slots, jobs, seconds, width
+        self.evaluations = evaluations
         self.now, self.generation = 0.0, 0
         self.spent = {"score": 0.0, "evaluate": 0.0}
         self.closed = []  # when each generation was
@@ -31,12 +32,6 @@ class Simulated:
         for name in self._backlog:
             self.fleet.add_worker(name, slots, "f", 0.0)
         self._beat_at = 0.0
-
-    def evaluate(self, episodes):
-        vector = vector_bytes(np.full(4, 1.0 + self.generation))
-        work = make_work(SPEC, "evaluate", self.generation, 0, vector, range(5000, 5000 + episodes))
-        self._open[self.generation] = {each.job.digest for each in work}
-        self.fleet.jobs.offer(work)
 
     def run(self, until):
         """Until so many generations are closed."""
@@ -66,16 +61,15 @@ class Simulated:
         if self._left == 0 and job.kind == "score":
             self.closed.append(self.now)
             self.generation += 1
-            self.before_next(self.generation)
+            if episodes := self.evaluations(self.generation):
+                evaluation = work(episodes, "evaluate", self.generation)
+                self._open[self.generation] = {each.job.digest for each in evaluation}
+                self.fleet.jobs.offer(evaluation)
             self.fleet.jobs.begin_generation(self.generation)
             self._offer()
 
-    def before_next(self, generation):
-        """What is to happen as a generation opens."""
-
     def _offer(self):
-        vector = vector_bytes(np.arange(4.0) + self.generation)
-        self.fleet.jobs.offer(make_work(SPEC, "score", self.generation, 0, vector, range(self.jobs)))
+        self.fleet.jobs.offer(work(self.jobs, generation=self.generation))
         self._left = self.jobs
 
     def _give(self):
@@ -99,26 +93,11 @@ class Simulated:
         """Everything that was given is held; batches are seen."""
         self._beat_at = self.now + 1.0
         for name, backlog in self._backlog.items():
-            running = tuple(RunningJob(job.digest[:TAG_BYTES], 1) for turn in self._running[name] for job in turn)
-            member = self.fleet.members[name]
-            beat = Heartbeat(
-                **HEAD, nonce="n", numbering=member.numbering, seen=member.number,
-                capacity=self.slots * self.width, slots=self.slots, load=0.0,
-                steps_per_second=0.0, drawn_by="-", queued=tuple(job.digest[:TAG_BYTES] for job in backlog),
-                running=running, unacked=(),
-            )  # fmt: skip
-            self.fleet.handle_heartbeat(name, beat, self.now)
-
-
-def every(period, episodes):
-    """An evaluation of so many tracks each `period` generations."""
-
-    class Evaluated(Simulated):
-        def before_next(self, generation):
-            if generation % period == 0:
-                self.evaluate(episodes)
-
-    return Evaluated
+            running = [job.digest for turn in self._running[name] for job in turn]
+            queued = [job.digest for job in backlog]
+            seen = self.fleet.members[name].number
+            shown = beat(self.slots * self.width, seen, queued=queued, running=running, steps=1)
+            self.fleet.handle_heartbeat(name, replace(shown, slots=self.slots), self.now)
 
 
 EVEN = {"score": 1.0, "evaluate": 1.0}
@@ -139,7 +118,7 @@ DREAMT = {"score": 0.01, "evaluate": 1.0}
     ids=["two slots", "one slot", "one slot, cut", "dreams", "sixteen slots", "a thousand slots"],
 )
 def test_an_evaluation_is_finished_within_two_generations(workers, slots, jobs, seconds, width, episodes):
-    fleet = every(3, episodes)(workers, slots, jobs, seconds, width)
+    fleet = Simulated(workers, slots, jobs, seconds, width, lambda generation: episodes * (generation % 3 == 0))
     fleet.run(until=8)
     assert sorted(fleet.done) == [3, 6]
     for generation, done in fleet.done.items():
@@ -151,8 +130,10 @@ def test_an_evaluation_is_finished_within_two_generations(workers, slots, jobs, 
 @pytest.mark.parametrize(("workers", "slots"), [(1, 1), (2, 2)])
 def test_while_evaluations_wait_they_have_their_share_of_the_slots_time(workers, slots, seconds, share):
     """Measured in seconds of the slots; more always wait than the share allows."""
-    jobs = int(150 * workers * slots / seconds["score"])
-    fleet = every(1, 1000 * workers * slots)(workers, slots, min(jobs, 2500), seconds, evaluation_share=share)
+    jobs = min(int(150 * workers * slots / seconds["score"]), 2500)
+    fleet = Simulated(
+        workers, slots, jobs, seconds, evaluations=lambda _: 1000 * workers * slots, evaluation_share=share
+    )
     fleet.run(until=1)
     before = dict(fleet.spent)
     fleet.run(until=2)
@@ -163,15 +144,14 @@ def test_while_evaluations_wait_they_have_their_share_of_the_slots_time(workers,
 
 def test_what_was_not_used_is_not_saved_up():
     """After many generations without an evaluation, one takes its share and not the fleet."""
-    fleet = Simulated(2, 1, 256, EVEN)
-    fleet.before_next = lambda generation: generation == 12 and fleet.evaluate(1000)
+    fleet = Simulated(2, 1, 256, EVEN, evaluations=lambda generation: 1000 * (generation == 12))
     fleet.run(until=13)
     assert 256 / 3 - 4 <= fleet.spent["evaluate"] <= 256 / 3 + 4
     assert fleet.closed[12] - fleet.closed[11] <= 128 * 4 / 3 + 4
 
 
 def test_without_a_share_they_take_what_is_idle():
-    fleet = every(4, 32)(2, 1, 256, EVEN, evaluation_share=0.0)
+    fleet = Simulated(2, 1, 256, EVEN, evaluations=lambda generation: 32 * (generation % 4 == 0), evaluation_share=0.0)
     fleet.run(until=8)
     assert fleet.spent["evaluate"] <= 4
 
@@ -195,18 +175,9 @@ def test_a_suspended_host_neither_starves_nor_floods():
     assert went <= 2 * OUTLIER
 
 
-def test_a_job_that_comes_back_undone_reserves_nothing():
-    share = DeficitCounter(0.25)
-    share.reserve(b"e")
-    assert not share.is_due(1)
-    share.release(b"e")
-    assert share.is_due(1)
-
-
 def test_a_lost_workers_evaluation_goes_again_at_once():
     fleet = fleet_of(A, jobs=0)
-    fleet.jobs.offer(make_work(SPEC, "evaluate", 0, 0, vector_bytes(np.zeros(4)), [1]))
-    fleet.jobs.offer(make_work(SPEC, "score", 1, 0, vector_bytes(np.ones(4)), range(9)))
+    fleet.jobs.offer([*work(1, "evaluate"), *work(9, generation=1)])
     assert [each.job.kind for send in fleet.dispatch(0.0) for each in send.work] == ["evaluate", "score"]
     fleet.handle_departure(A, 0.1)
     fleet.tick(1.0)

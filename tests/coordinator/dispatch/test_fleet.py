@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from dreamfleet.common.protocol.messages import MAX_SLOTS, TAG_BYTES, Result
+from dreamfleet.common.protocol.messages import MAX_SLOTS, Result
 from dreamfleet.coordinator.dispatch.event_log import latest
 from dreamfleet.coordinator.dispatch.fleet import (
     DEPARTURE_GRACE,
@@ -33,15 +33,12 @@ def cancelled(sends, name):
     return [digest for send in sends if send.identity == name for digest in send.cancels]
 
 
-def test_no_work_before_the_first_heartbeat():
+def test_credit_is_twice_the_capacity_from_the_first_heartbeat_on_and_a_result_returns_it():
     fleet = Fleet(BEAT)
-    fleet.jobs.offer(work(3))
+    fleet.jobs.offer(work(10))
     fleet.add_worker(A, 2, "f", 0.0)
     assert fleet.dispatch(0.0) == []
-
-
-def test_credit_is_twice_the_capacity_and_a_result_returns_it():
-    fleet = fleet_of(A, capacity=2)
+    fleet.handle_heartbeat(A, beat(2), 0.0)
     given = digests(fleet.dispatch(0.0), A)
     assert len(given) == 4
     assert fleet.dispatch(0.1) == []
@@ -62,36 +59,16 @@ def test_of_drives_a_wide_worker_is_given_as_many_as_its_slots_do_at_once_and_on
 
 def test_as_drives_run_out_a_job_that_waits_behind_one_goes_to_an_idle_slot():
     fleet = fleet_of(A, jobs=0)
-    able = replace(beat(capacity=4), slots=1, together=4)
-    fleet.handle_heartbeat(A, able, 0.0)
+    fleet.handle_heartbeat(A, replace(beat(4), slots=1, together=4), 0.0)
     fleet.jobs.offer(work(2, generation=1))
     first, second = digests(fleet.dispatch(0.0), A)
     fleet.add_worker(B, 1, "f", 1.0)
-    fleet.handle_heartbeat(B, able, 1.0)
-    fleet.handle_heartbeat(A, replace(able, seen=1, running=beat(running=(first,)).running), 1.0)
-    fleet.handle_heartbeat(
-        A, replace(able, seen=1, queued=(second[:TAG_BYTES],), running=beat(running=(first,)).running), 1.1
-    )
+    fleet.handle_heartbeat(B, replace(beat(4), slots=1, together=4), 1.0)
+    shown = beat(4, seen=1, queued=[second], running=[first])
+    fleet.handle_heartbeat(A, replace(shown, slots=1, together=4), 1.1)
     sends = fleet.dispatch(1.1)
     assert digests(sends, B) == [second]
     assert cancelled(sends, A) == [second]
-
-
-def test_batches_count_without_a_gap():
-    fleet = fleet_of(A)
-    numbers = []
-    for step in range(5):
-        for send in fleet.dispatch(step / 100):
-            numbers.append(send.number)
-            for each in send.work:
-                fleet.handle_result(A, result(each.job.digest), step / 100)
-    assert numbers == list(range(1, len(numbers) + 1))
-
-
-def test_work_is_spread_over_workers():
-    fleet = fleet_of(A, B, jobs=2)
-    sends = fleet.dispatch(0.0)
-    assert len(digests(sends, A)) == len(digests(sends, B)) == 1
 
 
 def test_the_first_wanted_result_wins_and_the_others_copy_is_cancelled():
@@ -104,10 +81,7 @@ def test_the_first_wanted_result_wins_and_the_others_copy_is_cancelled():
     assert fleet.handle_result(A, result(digest), 0.3)[0] == "accepted"
     assert [send.cancels for send in fleet.dispatch(0.3) if send.identity == B] == [[digest]]
     assert fleet.handle_result(B, result(digest), 0.4)[0] == "duplicate"
-
-
-def test_a_result_of_an_unwanted_job_is_obsolete():
-    assert fleet_of(A).handle_result(A, result(b"x" * 32), 0.0)[0] == "obsolete"
+    assert fleet.handle_result(B, result(b"x" * 32), 0.4)[0] == "obsolete"
 
 
 def test_a_departed_workers_jobs_are_given_again_after_the_grace():
@@ -183,31 +157,20 @@ def test_a_strangers_farewell_in_the_name_of_a_live_worker_ends_with_its_next_he
     assert not fleet.members[A].farewell
 
 
-@pytest.mark.parametrize(("last", "wasted"), [("running", 4), ("finished", 10), ("queued", 0)])
-def test_what_a_lost_worker_had_done_of_a_job_is_waste_once_another_has_scored_it(last, wasted):
+@pytest.mark.parametrize(
+    ("last", "scorer", "wasted"), [("running", B, 4), ("unacked", B, 10), ("queued", B, 0), ("unacked", A, 0)]
+)
+def test_what_a_lost_worker_had_done_of_a_job_is_waste_once_another_has_scored_it(last, scorer, wasted):
     fleet = fleet_of(A, jobs=1)
     (digest,) = digests(fleet.dispatch(0.0), A)
-    shown = {"running": "running", "finished": "unacked", "queued": "queued"}[last]
-    fleet.handle_heartbeat(A, beat(seen=1, steps=4, **{shown: [digest]}), 1.0)
+    fleet.handle_heartbeat(A, beat(seen=1, steps=4, **{last: [digest]}), 1.0)
     fleet.handle_departure(A, 1.0)
     fleet.tick(2.0)
-    join(fleet, B, 2.0)
-    assert digests(fleet.dispatch(2.0), B) == [digest]
+    join(fleet, scorer, 2.0)
+    assert digests(fleet.dispatch(2.0), scorer) == [digest]
     assert fleet.counts["discarded_steps"] == 0
-    fleet.handle_result(B, result(digest), 3.0)
+    fleet.handle_result(scorer, result(digest), 3.0)
     assert fleet.counts["discarded_steps"] == wasted
-
-
-def test_a_worker_that_brings_its_result_after_all_wasted_nothing():
-    fleet = fleet_of(A, jobs=1)
-    (digest,) = digests(fleet.dispatch(0.0), A)
-    fleet.handle_heartbeat(A, beat(seen=1, unacked=[digest]), 1.0)
-    fleet.handle_departure(A, 1.0)
-    fleet.tick(2.0)
-    fleet.add_worker(A, 1, "f", 2.0)
-    fleet.handle_heartbeat(A, beat(unacked=[digest]), 2.0)
-    fleet.handle_result(A, result(digest), 2.0)
-    assert fleet.counts["discarded_steps"] == 0
 
 
 def test_a_failed_job_is_wasted_once():
@@ -232,7 +195,7 @@ def test_the_list_of_lost_workers_is_bounded():
 def test_a_silent_workers_jobs_are_given_again_and_a_heartbeat_brings_it_back():
     fleet = fleet_of(A, B, jobs=2)
     (digest,) = digests(fleet.dispatch(0.0), A)
-    late = SILENT_AFTER * BEAT + 0.1
+    late, before = SILENT_AFTER * BEAT + 0.1, fleet.members[A].numbering
     for step in range(1, 6):
         fleet.handle_heartbeat(B, beat(seen=1, running=digests([], B)), float(step))
         fleet.tick(float(step))
@@ -240,9 +203,12 @@ def test_a_silent_workers_jobs_are_given_again_and_a_heartbeat_brings_it_back():
     fleet.tick(late)
     assert fleet.members[A].silent
     assert digest in digests(fleet.dispatch(late), B)
-    fleet.handle_heartbeat(A, beat(seen=1, running=[digest]), late + 1)
+    fleet.handle_heartbeat(A, beat(numbering=before, seen=1, running=[digest]), late + 1)
     assert not fleet.members[A].silent
     assert digest in fleet.members[A].leases
+    fleet.jobs.offer(work(1, generation=1))
+    (send,) = [send for send in fleet.dispatch(late + 1) if send.identity == A]
+    assert (send.numbering > before, send.number, len(send.work)) == (True, 1, 1), "it counts from one again"
 
 
 def test_a_suspended_host_is_not_taken_for_silence():
@@ -284,6 +250,25 @@ def test_an_error_is_no_fitness_and_another_worker_tries():
     assert errors == {A: "boom", B: "boom"}
 
 
+@pytest.mark.parametrize(
+    ("other", "taker"), [("idle", B), ("busy", None), ("a guest", A), ("held back", A), ("not ready", A)]
+)
+def test_a_failed_job_goes_to_another_worker_or_waits_for_it_if_it_can_take_jobs_at_all(other, taker):
+    fleet = fleet_of(A, jobs=1)
+    (digest,) = digests(fleet.dispatch(0.0), A)
+    fleet.add_worker(B, 1, "f", 0.0)
+    if other != "a guest":
+        fleet.handle_heartbeat(B, beat(0 if other == "not ready" else 1), 0.0)
+        fleet.members[B].is_held = other == "held back"
+    if other == "busy":
+        fleet.jobs.offer(work(3, generation=1))
+        assert len(digests(fleet.dispatch(0.0), B)) == 2
+    fleet.handle_result(A, result(digest, error=failure("boom")), 0.1)
+    given = [(send.identity, each.digest) for send in fleet.dispatch(0.2) for each in send.work]
+    assert given == ([(taker, digest)] if taker else [])
+    assert [each.errors for each in fleet.jobs.failures] == [{A: "boom"}]
+
+
 def test_the_only_worker_tries_a_failed_job_again_but_not_for_ever():
     fleet = fleet_of(A, jobs=1)
     for attempt in range(3):
@@ -292,14 +277,6 @@ def test_the_only_worker_tries_a_failed_job_again_but_not_for_ever():
         (digest,) = digests(fleet.dispatch(attempt), A)
         fleet.handle_result(A, result(digest, error=failure("boom")), attempt)
     assert fleet.failure_judge.find_pausing().errors == {A: "boom"}
-
-
-def test_a_failed_job_waits_for_another_worker_that_is_busy():
-    fleet = fleet_of(A, B, jobs=4)
-    first, *_ = digests(fleet.dispatch(0.0), A)
-    fleet.handle_result(A, result(first, error=failure("boom")), 0.1)
-    assert digests(fleet.dispatch(0.2), A) == []
-    assert [failure.errors for failure in fleet.jobs.failures] == [{A: "boom"}]
 
 
 @pytest.mark.parametrize(
@@ -421,13 +398,9 @@ def test_what_waits_for_a_slot_that_another_run_uses_is_taken_over_and_not_copie
     assert cancelled(sends, A) == [given[-1]]
 
 
-def test_a_job_that_is_nearly_done_is_not_copied():
-    fleet, _ = tail_of_two(pace_a=1000.0, pace_b=1000.0, steps_a=100)
-    assert digests(fleet.dispatch(1.0), B) == []
-
-
-def test_the_job_of_a_worker_that_has_gone_quiet_is_copied_before_it_counts_as_lost():
+def test_a_job_that_is_nearly_done_is_copied_only_once_its_worker_has_gone_quiet():
     fleet, job = tail_of_two(pace_a=1000.0, pace_b=1000.0, steps_a=100)
+    assert digests(fleet.dispatch(1.0), B) == []
     fleet.handle_heartbeat(B, beat(seen=9), 3.1)
     assert digests(fleet.dispatch(3.1), B) == [job]
     assert not fleet.members[A].silent
@@ -441,21 +414,17 @@ def test_memory_stays_flat_through_a_hundred_thousand_generations_of_churn():
     tracemalloc.start()
     held = []
     for generation in range(100_000):
-        now = generation / 10
+        now, name = generation / 10, f"w/{random.integers(2**32):08x}"
         fleet.jobs.begin_generation(generation)
         fleet.jobs.offer(work(2, generation=generation))
-        name = f"w/{random.integers(2**32):08x}"
         fleet.add_worker(name, 2, "f", now)
-        fleet.handle_heartbeat(A, beat(4, seen=fleet.members[A].number), now)
-        fleet.handle_heartbeat(name, beat(2, seen=fleet.members[name].number), now)
         while fleet.jobs:
-            for who in (A, name):
+            for who, capacity in ((A, 4), (name, 2)):
+                fleet.handle_heartbeat(who, beat(capacity, seen=fleet.members[who].number), now)
                 for digest in digests(fleet.dispatch(now), who):
                     if random.random() < 0.8:
                         fleet.handle_result(who, result(digest), now)
             now += 0.001
-            fleet.handle_heartbeat(A, beat(4, seen=fleet.members[A].number), now)
-            fleet.handle_heartbeat(name, beat(2, seen=fleet.members[name].number), now)
         fleet.handle_departure(name, now)
         fleet.tick(now + 0.06)
         fleet.notes.clear()
@@ -493,14 +462,6 @@ def test_a_member_is_forgotten_only_after_a_long_silence():
     assert fleet.handle_result(A, result(given[0]), 100.0)[0] == "accepted", "its results still count"
 
 
-def test_a_guest_keeps_no_failing_job_from_being_tried_again():
-    fleet = fleet_of(A, jobs=1)
-    (digest,) = digests(fleet.dispatch(0.0), A)
-    fleet.add_worker(B, 4, "f", 0.0)
-    fleet.handle_result(A, result(digest, error=failure("killed")), 0.1)
-    assert digests(fleet.dispatch(0.2), A) == [digest]
-
-
 def known(fleet, name, seconds=0.1, at=0.0):
     """Let a worker return all its jobs, each batch after `seconds`."""
     while given := digests(fleet.dispatch(at), name):
@@ -510,7 +471,7 @@ def known(fleet, name, seconds=0.1, at=0.0):
     return at
 
 
-def test_an_idle_worker_gets_an_empty_batch_now_and_then():
+def test_an_idle_worker_gets_an_empty_batch_now_and_then_while_it_is_heard():
     fleet = fleet_of(A, jobs=0)
     heard = []
     for tenth in range(100):
@@ -520,22 +481,13 @@ def test_an_idle_worker_gets_an_empty_batch_now_and_then():
     assert {number for _, number in heard} == {0}
     assert 2 <= len(heard) <= 5
     assert max(late - early for (early, _), (late, _) in pairwise(heard)) < SILENT_AFTER * BEAT
-
-
-def test_a_worker_that_sends_nothing_gets_nothing():
-    fleet = fleet_of(A, jobs=0)
-    fleet.dispatch(3.0)
-    assert fleet.dispatch(9.0) == []
-
-
-def heavy(count):
-    vector = vector_bytes(np.arange(90_000.0))
-    return make_work(SPEC, "score", 0, 0, vector, range(1000, 1000 + count))
+    fleet.dispatch(12.0)
+    assert fleet.dispatch(20.0) == []
 
 
 def test_a_large_batch_has_the_time_that_its_link_takes():
     fleet = fleet_of(A, jobs=0)
-    fleet.jobs.offer(heavy(1))
+    fleet.jobs.offer(make_work(SPEC, "score", 0, 0, vector_bytes(np.arange(90_000.0)), [1000]))
     parts = fleet.dispatch(0.0)
     for second in range(1, 8):  # 360 kB at 50 kB a second
         fleet.handle_heartbeat(A, beat(seen=second), float(second))
@@ -676,19 +628,6 @@ def test_a_heartbeat_that_confirms_batches_that_were_not_sent_starts_a_new_numbe
     assert (send.number, digests([send], A)) == (1, given[1:])
 
 
-def test_after_a_silence_a_new_numbering_starts_at_one():
-    fleet = fleet_of(A, jobs=4)
-    lost = fleet.dispatch(0.0)[0]
-    fleet.tick(0.5)
-    for now in np.arange(1.0, SILENT_AFTER * BEAT + 1.5):
-        fleet.tick(now)
-    assert fleet.members[A].silent
-    fleet.handle_heartbeat(A, beat(numbering=lost.numbering), 7.0)
-    (send,) = [send for send in fleet.dispatch(7.0) if send.work]
-    assert send.numbering > lost.numbering
-    assert send.number == 1
-
-
 def test_a_late_heartbeat_from_before_a_hello_confirms_no_later_batch():
     fleet = fleet_of(A, jobs=4)
     first = fleet.members[A].numbering
@@ -744,7 +683,8 @@ def test_a_host_that_is_lost_again_and_again_gets_only_what_it_returns_in_time()
         fleet.handle_departure(name, now + 1.5)
         fleet.tick(now + 1.6)
         now += 2.0
-    assert fleet._hosts.get("b").losses == 3
-    fleet._hosts.get("b").record_turnaround(1, 1.0, now)
-    assert fleet._hosts.get("b").is_likely_lost(1, age=0.0)
-    assert not fleet._hosts.get("b").is_likely_lost(1, age=60.0)
+    join(fleet, "b/00000009", now)
+    host_stats = fleet.members["b/00000009"].host_stats
+    assert host_stats.losses == 3
+    host_stats.record_turnaround(1, 1.0, now)
+    assert [host_stats.is_likely_lost(1, age) for age in (0.0, 60.0)] == [True, False]
