@@ -18,7 +18,6 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import path_exists
-from dreamfleet.common.host.add_ons import add_on
 from dreamfleet.common.host.stop_signals import Stop
 from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.common.runs.records import StoredEvaluation, best_evaluation
@@ -33,6 +32,7 @@ from dreamfleet.experiments.iteration.requests import Requests
 from dreamfleet.experiments.kept_document import write_document
 from dreamfleet.experiments.local_run import LocalFleet, coordinator_words, evolve, has_ended
 from dreamfleet.worker.addons.bundles.extract import ExtractRequest, extract_models
+from dreamfleet.worker.addons.inspection.measure import measure
 from dreamfleet.worker.addons.refit.refit_stage import refit_controller
 from dreamfleet.worker.addons.refit.subspace_stage import fit_subspace
 from dreamfleet.worker.training.stages.bundle import build_bundle
@@ -155,7 +155,7 @@ class PhaseRunner:
             for what, request in requests.items():
                 measured[side][what] = None, unfitted
                 if (side, what) != ("new", "losses") or not unfitted:
-                    measured[side][what] = self._try(number, f"gate-{side}-{what}", add_on("measure"), request)
+                    measured[side][what] = self._try(number, f"gate-{side}-{what}", measure, request)
         plain = {
             side: {what: report.facts if report else {"failed": why} for what, (report, why) in each.items()}
             for side, each in measured.items()

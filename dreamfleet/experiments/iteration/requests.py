@@ -6,10 +6,8 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from dreamfleet.common.cli.world_flags import OPTIONS, world_arguments
-from dreamfleet.common.host.add_ons import add_on
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.runs.seeds import VALIDATION
 from dreamfleet.experiments.command_lines import Words, options
@@ -18,6 +16,7 @@ from dreamfleet.experiments.iteration.layout import IterationFolder
 from dreamfleet.experiments.iteration.ledger import IterationLedger
 from dreamfleet.experiments.iteration.plan import EVOLVE, GATE, MDNRNN, VAE, Phase
 from dreamfleet.experiments.pipeline import read_bundle, read_training
+from dreamfleet.worker.addons.inspection.measure import FigureName, MeasureRequest
 from dreamfleet.worker.addons.refit.refit_stage import RefitRequest
 from dreamfleet.worker.addons.refit.subspace_stage import SubspaceRequest
 from dreamfleet.worker.training.stages.bundle import BundleRequest
@@ -86,7 +85,7 @@ class Requests:
         bundle = str(self.layout.bundle(self.ledger.model_round(number)))
         return SubspaceRequest(bundle, self.layout.root, path, views=self.config.views)
 
-    def gate(self, number: int) -> dict[str, dict[str, Any]]:
+    def gate(self, number: int) -> dict[str, dict[FigureName, MeasureRequest]]:
         """What is measured of the `old` and the `new` world model: `probe`, `losses`, `survival`.
 
         Both are probed on the same drives of the last round's optimum. For losses the optimum drives in the dream, so
@@ -96,17 +95,18 @@ class Requests:
         optimum = layout.optimum(number - 1)
         sides = {"old": (layout.bundle(self.ledger.model_round(number - 1)), optimum),
                  "new": (layout.bundle(number), layout.refitted(number))}  # fmt: skip
-        found: dict[str, dict[str, Any]] = {side: {} for side in sides}
+        found: dict[str, dict[FigureName, MeasureRequest]] = {side: {} for side in sides}
         for side, (bundle, driver) in sides.items():
-            for figure, episodes, controller in (
+            asked: tuple[tuple[FigureName, int, Path | None], ...] = (
                 ("probe", config.gate_drives, optimum),
                 ("losses", config.gate_losses, driver),
                 ("survival", config.survival_episodes, None),
-            ):
+            )
+            for figure, episodes, controller in asked:
                 if episodes:
-                    found[side][figure] = add_on("measure-request")(
-                        (figure,), str(bundle), controller and str(controller), episodes=episodes, seed=GATE_SEED,
-                        noise=GATE_NOISE,
+                    found[side][figure] = MeasureRequest(
+                        (figure,), str(bundle), str(controller) if controller else None, episodes=episodes,
+                        seed=GATE_SEED, noise=GATE_NOISE,
                     )  # fmt: skip
         return found
 
