@@ -18,10 +18,9 @@ from pathlib import Path
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.worker.addons.bench.sleep_tasks import SLEEP_TASK
-from tests.support.access import until
 from tests.support.bundles import write_random_bundle
 from tests.support.hosts import new_host
-from tests.support.processes import processes_in
+from tests.support.processes import processes_in, until
 
 NAPPING = ("--task", SLEEP_TASK, "--population", "8", "--episodes", "2")  # 16 naps of 50 ms
 DREAMING = ("--preset", "dream", "--population", "16", "--episodes", "4", "--horizon", "200")
@@ -38,21 +37,18 @@ class Bench:
         self._processes, self._host, self._tasks = processes, host, tasks
         near = f"tcp/{host.address}:{processes.port}"
         self._near = near
-        self.coordinator = processes.start(
-            "coordinator", "--run", "run", "--runs-dir", processes.runs, "--listen", processes.endpoint, near,
-            "--insecure", "--bundle", bundle, "--evaluate-every", 0, "--generations", 10**6, *settings,
-        )  # fmt: skip
-        self.coordinator.wait_until_serving()
+        at = ("--listen", processes.endpoint, near, "--insecure")
+        processes.coordinator("--bundle", bundle, "--evaluate-every", 0, *settings, "--beat", 1, name="run", at=at)
         self.good = self.worker("good", inside=("taskset", "-c", "0"))
         until(lambda: self._closed() > 2, "three generations are closed")
 
     def worker(self, name, **more):
         return self._processes.worker("--run", "run", "--name", name, *self._tasks, **more)
 
-    def rate(self, seconds):
+    def rate(self):
         """Generations a second."""
         before, started = self._closed(), time.monotonic()
-        time.sleep(seconds)
+        time.sleep(SECONDS)
         return (self._closed() - before) / (time.monotonic() - started)
 
     def _closed(self):
@@ -115,20 +111,20 @@ def _ending(process):
         time.sleep(1.0)
 
 
-def measure(folder, kinds, dreaming, blocks, seconds):
+def measure(folder, dreaming):
     """The medians of each kind, and their ratio: how many times slower a generation becomes."""
     figures = {}
     settings, tasks = (DREAMING, ()) if dreaming else (NAPPING, ("--task", SLEEP_TASK))
     bundle = write_random_bundle(folder / "random.zip").path
-    for kind in kinds:
+    for kind in BADS:
         with new_host() as host, processes_in(folder / kind) as processes, busy_core(kind == "slow_core"):
             bench = Bench(processes, bundle, settings, host, tasks)
             alone, both, brought = [], [], []
-            for _ in range(blocks):
-                alone.append(bench.rate(seconds))
+            for _ in range(BLOCKS):
+                alone.append(bench.rate())
                 with getattr(bench, kind)():
                     time.sleep(SETTLING)
-                    both.append(bench.rate(seconds))
+                    both.append(bench.rate())
                     brought.append(bench.finished())
         pair = statistics.median(alone), statistics.median(both)
         figures[kind] = {"alone": round(pair[0], 3), "both": round(pair[1], 3), "ratio": round(pair[0] / pair[1], 3),
@@ -141,12 +137,9 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--dream", action="store_true", help="a real dream run, in place of naps")
-    parser.add_argument("--kinds", nargs="+", choices=BADS, default=BADS)
-    parser.add_argument("--blocks", type=int, default=BLOCKS)
-    parser.add_argument("--seconds", type=float, default=SECONDS)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        figures = measure(Path(name), arguments.kinds, arguments.dream, arguments.blocks, arguments.seconds)
+        figures = measure(Path(name), arguments.dream)
     if arguments.json:
         print(json.dumps(figures))
     return 0 if all(each["ratio"] <= 1.05 for each in figures.values()) else 1

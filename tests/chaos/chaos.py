@@ -3,8 +3,8 @@
     make chaos FAULTS=1000 SEED=7
 
 Faults come from the seed, each after a number of accepted results more than the one before; the last quarter strikes a
-task whose slots score 256 jobs together. Prints one line of JSON: whether every fitness, vector and the mean are equal,
-jobs lost, and the share of environment steps that did not count.
+task whose slots score 256 jobs together. Prints one line of JSON: for each task whether every fitness, vector and the
+mean are equal, jobs lost, and the share of environment steps that did not count.
 """
 
 import argparse
@@ -19,12 +19,10 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from dreamfleet.common.runs.run_folder import open_run
 from tests.chaos.fleet import EPISODES, POPULATION, Fleet, accepted
 from tests.chaos.kinds import KINDS
-from tests.support import tasks
+from tests.support import same_bits, tasks
 from tests.support.bundles import write_random_bundle
 from tests.support.disks import small_disk
 from tests.support.hosts import new_host
@@ -89,18 +87,12 @@ def _drive(fleet, processes, stage, faults, happened):
 
 
 def outcome(processes, generations):
-    """Every fitness and vector, every evaluation, and the reported mean; jobs lost, and jobs that count."""
+    """What the run computed, jobs lost, and jobs that count."""
     shutil.copytree(processes.runs, processes.folder / "runs-as-they-ended")  # their disk goes
+    whole = same_bits.outcome(processes, "run")
     with open_run(processes.runs, "run") as run:
-        places = [(g, i) for g in range(generations) for i in range(POPULATION)]
-        fitness = [run.fitness(*place) for place in places]
-        episodes = [[(each.seed, each.fitness, each.steps) for each in run.results(*place)] for place in places]
-        vectors = [run.candidate(*place).tobytes() for place in places]
-        mean = np.load(run.controller_path)["parameters"].tobytes()
-        lost = sum(EPISODES - len(each) for each in episodes)
-        whole = {"fitness": fitness, "episodes": episodes, "vectors": vectors, "evaluations": run.evaluations(),
-                 "confirmed": run.confirmation(), "mean": mean}  # fmt: skip
-        return whole, lost, run.result_count()
+        lost = generations * POPULATION * EPISODES - sum(map(len, whole.episodes))
+        return whole._asdict(), lost, run.result_count()
 
 
 def compare(folder, faults, seed, stage=NARROW, kinds=tuple(KINDS)):
@@ -126,15 +118,9 @@ def compare(folder, faults, seed, stage=NARROW, kinds=tuple(KINDS)):
     for name in different:
         print(f"{stage.name}: {name} differ: {_first_difference(calm[name], chaos[name])}", file=sys.stderr)
     return {
-        "identical": not different,
-        "lost": lost,
-        "waste": round(1 - counted / made, 4),
-        "faults": dict(happened),
-        "skipped": skipped,
-        "jobs": jobs,
-        "made": made,
-        "seconds": round(seconds),
-    }
+        "identical": not different, "lost": lost, "waste": round(1 - counted / made, 4), "faults": dict(happened),
+        "skipped": skipped, "jobs": jobs, "made": made, "seconds": round(seconds),
+    }  # fmt: skip
 
 
 def _first_difference(calm, chaos):
@@ -143,29 +129,6 @@ def _first_difference(calm, chaos):
         return f"{calm!r:.300} and {chaos!r:.300}"
     place = next(place for place, pair in enumerate(zip(calm, chaos, strict=True)) if pair[0] != pair[1])
     return f"at {place}: {calm[place]!r:.300} and {chaos[place]!r:.300}"
-
-
-def both(folder, faults, seed, kinds):
-    """Three quarters of the faults at width 1, the others at width 256; the figures together."""
-    wide = faults // 4
-    parts = {
-        stage.name: compare(folder, count, seed, stage, kinds)
-        for stage, count in ((NARROW, faults - wide), (WIDE, wide))
-        if count
-    }
-    jobs, made = (sum(part[name] for part in parts.values()) for name in ("jobs", "made"))
-    return {
-        "identical": all(part["identical"] for part in parts.values()),
-        "lost": sum(part["lost"] for part in parts.values()),
-        "waste": round(1 - 10 * jobs / made, 4),
-        "faults": dict(sum((Counter(part["faults"]) for part in parts.values()), Counter())),
-        "skipped": next(iter(parts.values()))["skipped"],
-        "jobs": jobs,
-        "stages": {
-            name: {each: part[each] for each in ("identical", "lost", "waste", "jobs", "seconds")}
-            for name, part in parts.items()
-        },
-    }
 
 
 def main():
@@ -183,18 +146,15 @@ def main():
     if unknown := set(kinds) - KINDS.keys():
         parser.error(f"no such kind of fault: {', '.join(unknown)}; there are: {', '.join(KINDS)}")
     with ExitStack() as stack:
-        if arguments.folder is None:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        else:
-            folder = arguments.folder
-            folder.mkdir(parents=True)
-        if arguments.stage == "both":
-            figures = both(folder, arguments.faults, arguments.seed, kinds)
-        else:
-            stage = NARROW if arguments.stage == "narrow" else WIDE
-            figures = compare(folder, arguments.faults, arguments.seed, stage, kinds)
+        folder = arguments.folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        folder.mkdir(parents=True, exist_ok=arguments.folder is None)
+        wide = {"narrow": 0, "wide": arguments.faults}.get(arguments.stage, arguments.faults // 4)
+        figures = {
+            stage.name: compare(folder, count, arguments.seed, stage, kinds)
+            for stage, count in ((NARROW, arguments.faults - wide), (WIDE, wide)) if count
+        }  # fmt: skip
     print(json.dumps(figures))
-    return 0 if figures["identical"] and not figures["lost"] else 1
+    return 0 if all(each["identical"] and not each["lost"] for each in figures.values()) else 1
 
 
 if __name__ == "__main__":

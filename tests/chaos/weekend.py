@@ -19,10 +19,9 @@ from collections import Counter
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-import numpy as np
-
 from dreamfleet.common.runs.run_folder import open_run
 from tests.chaos.fleet import children, kill
+from tests.support import same_bits
 from tests.support.disks import small_disk
 from tests.support.processes import processes_in
 from tests.support.relay import Relay
@@ -104,17 +103,12 @@ class Weekend:
         return getattr(self, f"_{kind.replace(' ', '_')}")(self.random.randrange(WORKERS))
 
     def _link(self, number):
-        self._cut([self.relays[number]])
+        self.relays[number].hold()
+        self.after(30, self.relays[number].release)
         return 30
 
     def _links(self, _number):
-        self._cut(self.relays)
-        return 30
-
-    def _cut(self, relays):
-        for relay in relays:
-            relay.hold()
-            self.after(30, relay.release)
+        return max(self._link(number) for number in range(WORKERS))
 
     def _coordinator(self, _number):
         kill(self.coordinator)
@@ -200,22 +194,14 @@ def _results(processes):
 
 def outcome(processes, generations):
     """What the run computed, without times; its story, and how many results are missing."""
+    computed = same_bits.outcome(processes, RUN)._asdict()
     with open_run(processes.runs, RUN) as run:
-        places = [(generation, number) for generation in range(generations) for number in range(16)]
-        fitness = [run.fitness(*place) for place in places]
-        computed = {
-            "vectors": [run.candidate(*place).tobytes() for place in places],
-            "fitness": fitness,
-            "statistics": [(each.mean, each.std, each.best, each.worst, each.sigma, each.steps, each.failed)
-                           for each in run.history()],
-            "evaluations": run.evaluations(),
-            "confirmed": run.confirmation(),
-            "mean": np.load(run.controller_path)["parameters"].tobytes(),
-            "failed": sorted({(each.generation, each.candidate) for each in run.failures() if each.kind == "score"}),
-        }  # fmt: skip
-        lost = sum(
-            2 - len(run.results(*place)) for place, value in zip(places, fitness, strict=True) if value is not None
-        )
+        computed["statistics"] = [(each.std, each.best, each.worst, each.failed) for each in run.history()]
+        computed["failed"] = sorted({(each.generation, each.candidate) for each in run.failures()
+                                     if each.kind == "score"})  # fmt: skip
+        scored = [each for each, fitness in zip(computed["episodes"], computed["fitness"], strict=True)
+                  if fitness is not None]  # fmt: skip
+        lost = sum(2 - len(each) for each in scored) + 16 * generations - len(computed["fitness"])
         return computed, lost, run.events(), Counter(each.cause for each in run.failures())
 
 
@@ -254,18 +240,11 @@ def main():
     (calm, *_), (found, happened, restarts, exits) = outcomes
     different = [name for name in calm[0] if calm[0][name] != found[0][name]]
     figures = {
-        "identical": not different,
-        "different": different,
-        "lost": found[1],
-        "generations": generations,
-        "failed_candidates": len(found[0]["failed"]),
-        "causes": dict(found[3]),
-        "faults": dict(happened),
-        "restarts": dict(restarts),
-        "worker_exits": exits,
-        "reported": is_reported(found[2], happened, restarts),
+        "identical": not different, "different": different, "lost": found[1], "generations": generations,
+        "failed_candidates": len(found[0]["failed"]), "causes": dict(found[3]), "faults": dict(happened),
+        "restarts": dict(restarts), "worker_exits": exits, "reported": is_reported(found[2], happened, restarts),
         "seconds": round(time.monotonic() - started),
-    }
+    }  # fmt: skip
     print(json.dumps(figures))
     return 0 if not different and not found[1] and not any(exits) and all(figures["reported"].values()) else 1
 

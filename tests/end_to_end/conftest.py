@@ -4,6 +4,7 @@ from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support import tasks
 from tests.support.access import Access
 from tests.support.attacks import SETTINGS, outcome
+from tests.support.browser import chromium
 from tests.support.bundles import write_random_bundle
 from tests.support.processes import free_port, processes_in
 from tests.support.sshd import ssh_hosts
@@ -14,6 +15,19 @@ def random_bundle(tmp_path_factory):
     """A world model of few megabytes: nearly all tests here only hand it on, from file to file and over the network."""
     path = tmp_path_factory.mktemp("bundle") / "random.zip"
     return write_random_bundle(path, vae=VAEConfig(channels=(8, 16, 32, 64)))
+
+
+@pytest.fixture(scope="session")
+def small(random_bundle):
+    """Flags of a run of four candidates that takes a second a generation; what stands behind them counts more."""
+    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 1, "--evaluate-every", 0,
+            "--task", tasks.SLOW_TOY)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as started:
+        yield started
 
 
 @pytest.fixture(scope="session")

@@ -4,9 +4,6 @@ Tests common/addons/batches/batch_client.py, common/addons/batches/remote_scorer
 coordinator/service/batch_queries.py.
 """
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
@@ -15,21 +12,8 @@ from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.protocol.batches import BatchError
 from tests.support import tasks
-from tests.support.access import begin as begin_secured
-from tests.support.access import until
-from tests.support.batches import PATIENCE, SIZE, begin, count_results, resume, rows, scorer, vectors
-from tests.support.processes import ROOT, call_here, environment, started
-from tests.support.relay import Relay
-
-CALLER = """
-import sys, numpy as np
-from dreamfleet import RemoteScorer
-with RemoteScorer(sys.argv[1], "test") as scorer:
-    batch = scorer.submit(np.load(sys.argv[2]), seeds=[1, 2], batch_id="mine")
-    print(batch.state, flush=True)
-    for found in batch.results():
-        print("scored", found.index, flush=True)
-"""
+from tests.support.batches import SIZE, begin, count_results, rows, scorer, vectors
+from tests.support.processes import call_here, until
 
 
 @pytest.fixture
@@ -57,7 +41,7 @@ def test_batches_are_scored_and_the_same_content_is_never_scored_twice(fleet):
         drawn.wait()
         assert drawn.refresh()._last.episodes == 3
         with Client(fleet.endpoint) as client:
-            until(lambda: client.status("test").state == "waiting for a batch", "the run waits")
+            until(lambda: client.status("test").state == "waiting for a batch")
             assert client.status("test").settings.evaluate_every == 0
     for verb in (("status", "--connect", fleet.endpoint), ("story", "--connect", fleet.endpoint),
                  ("runs", "list", "--runs-dir", fleet.runs), ("runs", "show", "test", "--runs-dir", fleet.runs),
@@ -142,48 +126,6 @@ def test_a_failed_candidate_has_no_fitness_and_an_error(processes, random_bundle
 
 
 @pytest.mark.slow
-def test_a_batch_is_cancelled_before_and_while_it_is_scored(processes, random_bundle):
-    begin(processes, random_bundle, task=tasks.SLOW_TOY)
-    processes.worker("--task", tasks.SLOW_TOY)
-    with scorer(processes) as search:
-        open_one = search.submit(vectors(30), seeds=[1], batch_id="open")
-        waiting = search.submit(vectors(3, 1.0), seeds=[1], batch_id="waiting")
-        last = search.submit(vectors(2, 2.0), seeds=[1], batch_id="last")
-        next(open_one.results())
-        assert waiting.refresh().state == "waiting"
-        assert waiting.cancel() == "cancelled"
-        assert open_one.cancel() == "cancelled"
-        assert np.isfinite(last.wait()).all()
-        found = list(open_one.results())
-        assert len(found) == 30
-        assert 0 < sum(each.fitness is not None for each in found) < 30
-        assert {each.error for each in found} == {None, "cancelled"}
-        assert {each.error for each in waiting.results()} == {"cancelled"}
-
-
-@pytest.mark.slow
-def test_a_caller_that_was_killed_goes_on_and_nothing_is_scored_twice(processes, random_bundle, tmp_path):
-    begin(processes, random_bundle, task=tasks.SLOW_TOY)
-    processes.worker("--task", tasks.SLOW_TOY)
-    np.save(tmp_path / "vectors.npy", vectors(12))
-    command = [sys.executable, "-c", CALLER, processes.endpoint, str(tmp_path / "vectors.npy")]
-
-    def call():
-        return started(command, env=environment(processes.cache), stdout=subprocess.PIPE, text=True, cwd=ROOT)
-
-    with call() as first:
-        while not first.stdout.readline().startswith("scored 1"):
-            pass
-        first.kill()
-    with call() as second:
-        out, _ = second.communicate(timeout=PATIENCE)
-    assert second.returncode == 0
-    assert sorted(int(line.split()[1]) for line in out.splitlines() if line.startswith("scored")) == [*range(12)]
-    assert count_results(processes) == (24, 240)
-    assert rows(processes, "SELECT id, state FROM batch") == [("mine", "complete")]
-
-
-@pytest.mark.slow
 def test_a_batch_outlives_the_kill_of_its_coordinator(processes, random_bundle):
     coordinator = begin(processes, random_bundle, task=tasks.SLOW_TOY)
     processes.worker("--task", tasks.SLOW_TOY)
@@ -193,40 +135,9 @@ def test_a_batch_outlives_the_kill_of_its_coordinator(processes, random_bundle):
         found = batch.results()
         next(found)
         coordinator.end()
-        resume(processes)
+        processes.resume().wait_until_serving()
         assert len([*found]) == 11
         assert np.isfinite(later.wait()).all()
         assert (search.score(vectors(12), seeds=[1, 2], batch_id="mine") == batch.wait()).all()
     assert count_results(processes) == (26, 260)
     assert rows(processes, "SELECT id, state FROM batch") == [("mine", "complete"), ("later", "complete")]
-
-
-@pytest.mark.slow
-def test_a_caller_waits_out_a_cut_link(fleet):
-    relay = Relay(fleet.port)
-    try:
-        with scorer(fleet, relay.endpoint) as search:
-            first = search.score(vectors(2), seeds=[1])
-            relay.hold()
-            relay.cut()
-            with Client(fleet.endpoint) as client:
-                assert client.status("test").generations == 1
-            relay.release()
-            assert (search.score(vectors(2), seeds=[1]) == first).all()
-    finally:
-        relay.close()
-
-
-@pytest.mark.slow
-def test_in_a_secured_fleet_only_an_operator_submits(processes, access, endpoint, random_bundle):
-    begin_secured(processes, access, endpoint, random_bundle, "--optimiser", "external")
-    processes.start("worker", "--join", access.path("first"), "--connect", endpoint, "--run", "safe", "--slots", 1,
-                    "--task", tasks.SLOW_TOY)  # fmt: skip
-    with RemoteScorer(access.network("operator", endpoint), "safe") as search:
-        assert np.isfinite(search.score(vectors(2), seeds=[1], batch_id="own")).all()
-    for who in ("viewer", "second"):
-        with RemoteScorer(access.network(who, endpoint), "safe", patience=0.0) as other:
-            with pytest.raises(ConnectionFailedError):
-                other.submit(vectors(1))
-            with pytest.raises(ConnectionFailedError):
-                other.find("own")

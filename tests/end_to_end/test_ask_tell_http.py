@@ -6,7 +6,6 @@ coordinator/addons/bridge/server.py and coordinator/addons/bridge/verb.py.
 """
 
 import base64
-import http.client
 import json
 import math
 import re
@@ -21,11 +20,14 @@ from contextlib import ExitStack
 
 import pytest
 
+from dreamfleet import RemoteScorer
+from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.host.reports import ADDRESS
 from dreamfleet.coordinator.addons.bridge.app import MOST_STREAMS
 from tests.support import tasks
 from tests.support.access import begin as begin_secured
-from tests.support.batches import begin, count_results, resume, vectors
+from tests.support.access import work
+from tests.support.batches import begin, count_results, vectors
 from tests.support.processes import DEADLINE, ROOT, free_port
 
 TOKEN = "0123456789abcdef0123456789abcdef"
@@ -220,19 +222,6 @@ def test_a_token_is_needed_where_there_is_one(processes, random_bundle, tmp_path
         assert bridge.ask("GET", "/v1/runs")[0] == 200
 
 
-def test_the_description_fits_the_answers(bridge):
-    status, described = bridge.ask("GET", "/openapi.json")
-    assert status == 200
-    assert described["openapi"] == "3.1.0"
-    schemas = described["components"]["schemas"]
-
-    named = re.findall(r"#/components/schemas/(\w+)", json.dumps(described))
-    assert set(named) | {"Submission"} == schemas.keys()
-    bridge.submit({"id": "a", "vectors": rows(1), "seeds": [1]})
-    assert bridge.batch("a")[1].keys() == schemas["Scores"]["properties"].keys()
-    assert bridge.ask("GET", "/v1/runs")[1]["runs"][0].keys() == schemas["Run"]["properties"].keys()
-
-
 def described_for_the_run(described):
     """The description with what only the run knows: its name, and the size of its vectors."""
     for way in (way for path in described["paths"].values() for way in path.values()):
@@ -256,7 +245,7 @@ def test_schemathesis_finds_no_broken_promise_in_the_description(processes, tmp_
     path.write_text(json.dumps(described))
     done = subprocess.run(
         [sys.executable, "-m", "schemathesis.cli", "run", path, "--url", bridge.address, "--phases", "coverage,fuzzing",
-         "--checks", "all", "--max-examples", "8", "--seed", "1", "--no-color"],
+         "--checks", "all", "--max-examples", "3", "--seed", "1", "--no-color"],
         cwd=tmp_path, capture_output=True, text=True, check=False, timeout=DEADLINE,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout
@@ -271,19 +260,6 @@ def test_seeds_outside_the_usual_range_are_remarked_and_too_many_refused(process
     assert bridge.submit({"id": "c", "vectors": packed, "seeds": [9_999.0, 20_000]})[1]["remark"] == ""
     assert bridge.submit({"id": "d", "vectors": rows(1), "seeds": [*range(2**20, 2**20 + 10_000)]})[0] == 201
     assert bridge.submit({"id": "e", "vectors": rows(1), "episodes": 10_001})[0] == 400
-
-
-def test_another_method_is_answered_with_those_that_there_are(processes):
-    processes.start("router", "--listen", processes.endpoint).wait_for(processes.endpoint)
-    bridge = Bridge(processes)
-    described = bridge.ask("GET", "/openapi.json")[1]["paths"]
-    for path, methods in described.items():
-        connection = http.client.HTTPConnection("127.0.0.1", bridge.port, timeout=DEADLINE)
-        connection.request("PATCH", path.format(run="test", id="a"))
-        answer = connection.getresponse()
-        allowed = {each.strip().lower() for each in answer.headers["allow"].split(",")}
-        connection.close()
-        assert (answer.status, allowed - {"head"}) == (405, methods.keys())
 
 
 @pytest.mark.slow
@@ -341,7 +317,7 @@ def test_a_killed_coordinator_answers_503_and_its_batches_go_on(processes, rando
     first = next(events)
     coordinator.end()
     assert bridge.submit(wanted)[0] == 503
-    resume(processes)
+    processes.resume().wait_until_serving()
     found = [first, *events]
     assert sorted(each["index"] for kind, each in found if kind == "candidate") == [*range(12)]
     assert found[-1][0] == "end"
@@ -352,10 +328,13 @@ def test_a_killed_coordinator_answers_503_and_its_batches_go_on(processes, rando
 @pytest.mark.slow
 def test_a_secured_fleet_needs_an_operators_file(processes, access, endpoint, random_bundle):
     begin_secured(processes, access, endpoint, random_bundle, "--optimiser", "external")
-    processes.start("worker", "--join", access.path("first"), "--connect", endpoint, "--run", "safe", "--slots", 1,
-                    "--task", tasks.SLOW_TOY)  # fmt: skip
+    work(processes, access, endpoint, "first")
     for who in ("viewer", "second"):
         assert processes.call("serve", "--join", access.path(who), "--connect", endpoint, "--port", 0)[0] == 1
+        with RemoteScorer(access.network(who, endpoint), "safe", patience=0.0) as other:
+            for ask in (lambda: other.submit(vectors(1)), lambda: other.find("a")):
+                with pytest.raises(ConnectionFailedError):
+                    ask()
     processes.endpoint = endpoint
     bridge = Bridge(processes, "--join", access.path("operator"))
     assert bridge.submit({"id": "a", "vectors": rows(2), "seeds": [1]}, run="safe")[0] == 201

@@ -11,7 +11,7 @@ from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL, ROLLOUTS
 from dreamfleet.coordinator.addons.runs import backup
-from tests.support.processes import call_here, processes_in
+from tests.support.processes import ROOT, call_here
 from tests.support.same_bits import GENERATIONS, SETTINGS, outcome
 
 FLAGS = (*SETTINGS, "--evaluate-every", 0, "--collect-every", 1, "--collect-episodes", 1)
@@ -40,6 +40,7 @@ def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, 
     served.popen.kill()
     shutil.rmtree(processes.runs / "test")
     assert [path.name for path in safe.iterdir()] == ["test"], "the earlier copy is gone"
+    assert (safe / "test" / BUNDLE).read_bytes() == find_bundle("tiny").path.read_bytes()
     with open_run(safe, "test") as copy:
         assert 2 <= len(copy.history()) < GENERATIONS
         assert all(path.is_file() for path in copy.rollouts())
@@ -53,19 +54,13 @@ def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, 
     assert len(list((processes.runs / "test" / ROLLOUTS).iterdir())) == GENERATIONS
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """A run of two generations, which no test changes, and what made it."""
-    with processes_in(tmp_path_factory.mktemp("finished")) as processes:
-        coordinator = processes.coordinator(
-            "--task", "gym:CartPole-v1", "--population", 4, "--generations", 2, "--evaluate-every", 0, "--horizon", 20
-        )
-        processes.worker("--run", "test")
-        assert coordinator.finish()[0] == 0
-        yield processes
+@pytest.fixture
+def finished(processes):
+    """A recorded run of twelve generations."""
+    shutil.copytree(ROOT / "tests" / "fixtures" / "runs" / "dream", processes.runs / "test")
+    return processes
 
 
-@pytest.mark.slow
 def test_what_cannot_be_a_copy_is_left_alone(finished, tmp_path):
     other = tmp_path / "other"
     for wrong in (finished.runs, tmp_path / "taken", other):
@@ -109,17 +104,7 @@ def test_a_call_that_is_interrupted_leaves_the_earlier_copy(finished, tmp_path, 
         backup.back_up(source, safe / "test")
     assert [path.name for path in safe.iterdir()] == ["test"]
     with open_run(safe, "test") as copy:
-        assert len(copy.history()) == 2
-
-
-@pytest.mark.slow
-def test_a_world_model_is_copied_too(processes, tmp_path):
-    coordinator = processes.coordinator(*SETTINGS, "--generations", 1, "--evaluate-every", 0)
-    processes.worker("--run", "test")
-    assert coordinator.finish()[0] == 0
-    assert back_up(processes, tmp_path / "safe")[0] == 0
-    copied = tmp_path / "safe" / "test" / BUNDLE
-    assert copied.read_bytes() == find_bundle("tiny").path.read_bytes()
+        assert len(copy.history()) == 12
 
 
 def test_two_at_once_leave_a_whole_copy(finished, tmp_path, monkeypatch):
@@ -137,7 +122,7 @@ def test_two_at_once_leave_a_whole_copy(finished, tmp_path, monkeypatch):
     assert [code for code, *_ in said] == [2]
     assert [path.name for path in safe.iterdir()] == ["test"]
     with open_run(safe, "test") as copy:
-        assert len(copy.history()) == 2
+        assert len(copy.history()) == 12
 
 
 def test_a_link_is_no_copy_to_replace(finished, tmp_path):

@@ -10,7 +10,7 @@ import pytest
 
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from tests.support import tasks
-from tests.support.processes import DEADLINE, call_here, command, environment, processes_in
+from tests.support.processes import DEADLINE, ROOT, call_here, command, environment, processes_in
 from tests.support.tables import cells
 
 
@@ -38,6 +38,10 @@ def complains(*arguments, says):
         (("--resume", "never"), "'never'"),
         (("--target", "900", "--evaluate-every", "0"), "--target"),
         (("--minutes", "-1"), "--minutes"),
+        (("--run", "archive"), "archive"),
+        (("--bundle", "able", "--init", "tiny"), " tiny "),
+        (("--optimiser", "cmea"), "cma, cma-me, cmaes-lra"),
+        (("--optimiser", "cmaes-sep", "--preset", "article"), "--covariance diagonal"),
     ],
 )
 def test_the_coordinator_complains(processes, arguments, says):
@@ -61,33 +65,18 @@ def test_an_unwritable_folder(processes, random_bundle):
     complains("collect", "--data", "/proc/dreamfleet", "--episodes", "1", says="--data")
 
 
-@pytest.mark.slow
-def test_an_existing_run_is_not_begun_again(processes, random_bundle):
-    settings = ("--bundle", random_bundle.path, "--task", tasks.SLOW_TOY, "--generations", 1)
-    processes.coordinator(*settings).end()
-    complains(
-        "coordinator", "--run", "test", "--runs-dir", processes.runs, "--listen", processes.endpoint,
-        "--bundle", random_bundle.path, says="--resume",
-    )  # fmt: skip
-    complains(
-        "coordinator", "--resume", "test", "--runs-dir", processes.runs, "--population", "8",
-        says="--population",
-    )  # fmt: skip
-
-
-def test_the_archives_own_name_is_no_runs(processes, random_bundle):
-    complains(
-        "coordinator", "--run", "archive", "--runs-dir", processes.runs, "--bundle", random_bundle.path,
-        says="archive",
-    )  # fmt: skip
-
-
 @pytest.fixture(scope="module")
 def begun(tmp_path_factory, random_bundle):
     """The folder of a run that has begun, which no test changes."""
     with processes_in(tmp_path_factory.mktemp("begun")) as processes:
         processes.coordinator("--bundle", random_bundle.path, "--task", tasks.TOY).end()
         yield processes.runs / "test"
+
+
+def test_an_existing_run_is_not_begun_again(processes, begun):
+    run = ("coordinator", "--runs-dir", begun.parent, "--listen", processes.endpoint)
+    complains(*run, "--run", "test", says="--resume")
+    complains(*run, "--resume", "test", "--population", "8", says="--population")
 
 
 @pytest.fixture
@@ -133,9 +122,7 @@ def test_a_full_stdout_is_one_line(processes, odd, more):
 def test_a_controller_of_another_shape(processes, tmp_path):
     path = tmp_path / "small.npz"
     Controller(ControllerShape(4, 3), np.zeros(15, np.float32), "car-racing", "ab" * 32).save(path)
-    complains("evaluate", "--controller", path, "--bundle", "tiny", "--episodes", "1",
-        says="tiny.zip",
-    )  # fmt: skip
+    complains("evaluate", "--controller", path, "--bundle", "tiny", "--episodes", "1", says="tiny.zip")
     complains("evaluate", "--controller", path, "--episodes", "1", says="--bundle")
     complains("evaluate", "--controller", "absent", says="'absent'")
     complains("record", "--controller", path, "--out", "drive.avi", says="drive.avi")
@@ -157,25 +144,18 @@ def test_runs_that_do_not_exist(processes):
     complains("verify", "candidate", "night", "--candidate", "first", says="'first'")
 
 
-@pytest.mark.slow
-def test_a_run_is_listed_shown_archived_and_deleted(processes, random_bundle):
-    coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--task", tasks.TOY, "--generations", 2, "--population", 4,
-        "--evaluate-every", 0,
-    )  # fmt: skip
-    processes.worker("--task", tasks.TOY)
-    assert coordinator.finish()[0] == 0
-    where = ("--runs-dir", processes.runs)
-    complains("runs", "delete", "test", *where, says="--yes")
-    _, shown, _ = call_here("runs", "show", "test", *where)
+def test_a_run_is_listed_shown_archived_and_deleted(processes):
+    runs = ("--runs-dir", processes.runs)
+    shutil.copytree(ROOT / "tests" / "fixtures" / "runs" / "dream", processes.runs / "test")
+    complains("runs", "delete", "test", *runs, says="--yes")
+    _, shown, _ = call_here("runs", "show", "test", *runs)
     rows = [cells(line) for line in shown.splitlines()]
-    assert ["task", tasks.TOY] in rows
-    assert ["task.bundle", random_bundle.sha256] in rows
-    assert [row[0] for row in rows[-2:]] == ["0", "1"], "a line a generation"
-    code, out, _ = call_here("runs", "archive", "test", *where, "--json")
+    assert ["task", "dream"] in rows
+    assert [row[0] for row in rows[-2:]] == ["10", "11"], "a line a generation"
+    code, out, _ = call_here("runs", "archive", "test", *runs, "--json")
     assert (code, json.loads(out)["archived"]) == (0, str(processes.runs / "archive" / "test"))
-    assert "test" not in call_here("runs", "list", *where)[1]
-    assert "test" in call_here("runs", "list", "--archived", *where)[1]
+    assert "test" not in call_here("runs", "list", *runs)[1]
+    assert "test" in call_here("runs", "list", "--archived", *runs)[1]
     archive = ("--runs-dir", processes.runs / "archive")
     assert "\ntest " in call_here("runs", "list", *archive)[1]
     code, out, _ = call_here("runs", "delete", "test", "--yes", *archive, "--json")

@@ -9,10 +9,10 @@ import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
-from tests.support.processes import DEADLINE, call_here
+from tests.support.processes import DEADLINE
 
 ODD = ("env", f"{tasks.ROUNDING}=1")  # a host on which a sum comes out otherwise, in its last bit
-GO_ON = "coordinator", "--resume", "test", "--generations", 2
+FURTHER = ("--generations", 2)
 OTHER_KERNEL = ("env", "OPENBLAS_CORETYPE=Nehalem")
 PRODUCT = (
     "import hashlib, numpy as np; a = np.sin(np.arange(24 * 16)).astype('f4').reshape(16, 24);"
@@ -20,67 +20,26 @@ PRODUCT = (
 )
 
 
-@pytest.fixture
-def settings(random_bundle):
-    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
-            "--task", tasks.ROUNDED)  # fmt: skip
-
-
-def own(processes, *more, **where):
-    return processes.worker("--task", tasks.ROUNDED, "--name", "own", *more, **where)
-
-
-def one_after_the_other(processes, settings, first, second):
-    """The first worker scores generation 0, the second one generation 1."""
-    coordinator = processes.coordinator(*settings, "--generations", 1)
-    started = first()
-    assert coordinator.finish()[0] == 0
-    getattr(started, "popen", started).kill()  # else it would score the next generation too
-    coordinator = processes.start(*GO_ON, "--runs-dir", processes.runs)
-    second()
-    assert coordinator.finish()[0] == 0
-    with open_run(processes.runs, "test") as run:
-        return run.classes
-
-
 @pytest.mark.slow
-def test_a_strict_run_refuses_another_class_and_stays_strict_when_resumed(processes, settings):
-    coordinator = processes.coordinator(*settings, "--generations", 1, "--strict")
-    first = own(processes)
+def test_a_strict_run_refuses_another_class_and_stays_strict_when_resumed(processes, small):
+    def work(inside=()):
+        return processes.worker("--task", tasks.ROUNDED, "--name", "own", inside=inside)
+
+    coordinator = processes.coordinator(*small, "--task", tasks.ROUNDED, "--generations", 1, "--strict")
+    first = work()
     assert coordinator.finish()[0] == 0
     first.end()  # else it would score the next generation
-    resumed = *GO_ON, "--runs-dir", processes.runs
-    coordinator = processes.start(*resumed)
-    odd = own(processes, inside=ODD)
+    coordinator = processes.resume("test", *FURTHER)
+    odd = work(ODD)
     assert "--no-strict" in odd.wait_for_event("refused")["message"]
     coordinator.wait_for_event("left")
     coordinator.end()
-    coordinator = processes.start(*resumed, "--no-strict")
-    own(processes, inside=ODD)
+    coordinator = processes.resume("test", *FURTHER, "--no-strict")
+    work(ODD)
     assert coordinator.finish()[0] == 0
     with open_run(processes.runs, "test") as run:
         assert run.classes.total == 2
         assert "strict" not in json.loads(run.fact("network"))
-
-
-@pytest.mark.slow
-def test_status_runs_show_and_list_name_the_classes_of_results(processes, settings):
-    coordinator = processes.coordinator(*settings, "--generations", 1000)
-    odd = own(processes, inside=ODD)
-    coordinator.wait_for_event("generation", number=0)
-    while "classes" not in (status := processes.status()):
-        pass  # the status is of a moment before
-    assert status["classes"]["total"] == 1
-    odd.end()
-    own(processes)
-    while (status := processes.status())["classes"]["total"] < 2:
-        pass
-    assert len({each["host_class"] for each in status["worker_list"]} - {""}) >= 1
-    _, out, _ = call_here("runs", "show", "test", "--runs-dir", processes.runs)
-    for each in status["classes"]["largest"]:
-        assert each["host_class"] in out
-    (row,) = json.loads(call_here("runs", "list", "--runs-dir", processes.runs, "--json")[1])
-    assert row["classes"] == 2
 
 
 def product(where):
@@ -93,15 +52,22 @@ def test_another_kernel_of_openblas_is_another_class_whose_results_are_replayed_
     """Real arithmetic, no test's: OpenBLAS with and without fused products, under gymnasium's BipedalWalker."""
     if product(()) == product(OTHER_KERNEL):
         pytest.skip("OpenBLAS rounds the same with every kernel that this processor has")
-    settings = ("--task", "gym:BipedalWalker-v3", "--population", 4, "--episodes", 2, "--horizon", 100, "--sigma0", 1.0,
-                "--evaluate-every", 0)  # fmt: skip
-    classes = one_after_the_other(processes, settings, lambda: processes.worker(inside=OTHER_KERNEL), processes.worker)
-    assert classes.total == 2
+    coordinator = processes.coordinator(
+        "--task", "gym:BipedalWalker-v3", "--population", 4, "--episodes", 2, "--horizon", 100, "--sigma0", 1.0,
+        "--evaluate-every", 0, "--generations", 1,
+    )  # fmt: skip
+    first = processes.worker(inside=OTHER_KERNEL)
+    assert coordinator.finish()[0] == 0
+    first.end()
+    coordinator = processes.resume("test", *FURTHER)
+    processes.worker()
+    assert coordinator.finish()[0] == 0
+    with open_run(processes.runs, "test") as run:
+        assert run.classes.total == 2
 
     def replayed(candidate, where=(), *more):
-        replay = processes.start(
-            "verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", candidate, *more, inside=where
-        )
+        words = ("verify", "candidate", "test", "--runs-dir", processes.runs, "--candidate", candidate, *more)
+        replay = processes.start(*words, inside=where)
         code, out = replay.finish()
         return code, out, "".join(replay.lines)
 

@@ -5,92 +5,44 @@ import json
 import shutil
 import signal
 import socket
-import subprocess
-import sys
 import time
 import urllib.error
 import urllib.request
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
-from statistics import median
 
 import pytest
-from playwright.sync_api import TimeoutError as SlowPageError
 
-from dreamfleet.common.host.processes import command
-from dreamfleet.common.host.reports import ADDRESS
 from tests.support import tasks
-from tests.support.browser import PATIENCE, chromium, tab
+from tests.support.browser import dashboard, tab, wait_for_text, wait_until
 from tests.support.processes import DEADLINE, call_here, free_port
 from tests.support.served import WORKER, serving, snapshot
 
 RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
 TOKEN = "correct horse battery"
+PAINTED = "all => all.every(each => each.getContext('2d').getImageData(each.width - 4, 9, 1, 1).data[3] > 0)"
 LEFT_OUT = ("Failed to load resource", "net::ERR")  # what a browser says by itself of a server that is gone
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as started:
-        yield started
-
-
-@pytest.fixture
-def settings(random_bundle):
-    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
-            "--task", tasks.SLOW_TOY)  # fmt: skip
-
-
-@contextmanager
-def dashboard(processes, *flags, runs=None):
-    """Its process, and the address that it printed."""
-    started = processes.start(
-        "dashboard", "--connect", processes.endpoint, "--runs-dir", runs or processes.runs, *flags
-    )
-    started.address = started.wait_for_report(ADDRESS)
-    yield started
-    started.end()
 
 
 @pytest.fixture
 def page(browser, processes):
-    with dashboard(processes, "--port", 0) as started, tab(browser) as page:
+    with dashboard(processes) as started, tab(browser) as page:
         page.goto(started.address)
-        page.address = started.address
         yield page
 
 
-def until(page, script, arg):
-    try:
-        page.wait_for_function(script, arg=arg, timeout=PATIENCE, polling=200)  # also without a frame
-    except SlowPageError as error:
-        error.add_note(f"said: {page.said}; shown: {page.locator('body').inner_text()[:2000]}")
-        raise
-
-
 def wait(page, text, part="state"):
-    until(page, "([part, text]) => document.querySelector(`[data-part=${part}]`)?.textContent.includes(text)",
-          [part, text])  # fmt: skip
+    wait_for_text(page, text, part)
 
 
 def drawn(page, text):
     """Wait until the fitness chart says so of its last generation."""
-    until(page, "text => document.querySelector('[data-part=fitness]')?.getAttribute('aria-label')?.includes(text)",
-          text)  # fmt: skip
+    script = "text => document.querySelector('[data-part=fitness]')?.getAttribute('aria-label')?.includes(text)"
+    wait_until(page, script, text)
 
 
 def part(page, name):
     return page.locator(f"[data-part={name}]").first.text_content()  # also of rows out of sight
-
-
-def gone(page, worker, name):
-    """Kill a worker that the page shows; seconds until the page shows that it is gone."""
-    row = f".workers tr[data-state=present] td:has-text('{name}')"
-    page.wait_for_selector(row, state="attached")
-    began = time.monotonic()
-    worker.popen.kill()
-    page.wait_for_selector(row, state="detached")
-    return time.monotonic() - began
 
 
 def without_absence(page):
@@ -98,11 +50,20 @@ def without_absence(page):
 
 
 @pytest.mark.slow
-def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes, settings, record_property):
+def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes, small, record_property):
     wait(page, "no coordinator")
     assert processes.endpoint in part(page, "sentence")
     wait(page, "dreamfleet coordinator --run NAME", "task")
-    coordinator = processes.coordinator(*settings, "--generations", 1000)
+    left = processes.coordinator(*small)
+    wait(page, "waiting for workers")
+    assert processes.call("pause", "test", "--connect", processes.endpoint)[0] == 0
+    wait(page, "By hand", "sentence")
+    left.popen.send_signal(signal.SIGTERM)
+    wait(page, "left open")
+    wait(page, "--resume test", "sentence")
+    coordinator = processes.resume("test", "--generations", 1000)
+    coordinator.wait_until_serving()
+    assert processes.call("resume", "test", "--connect", processes.endpoint)[0] == 0
     wait(page, "waiting for workers")
     assert part(page, "run") == "test"
     worker = processes.worker("--task", tasks.SLOW_TOY, "--name", "alpha")
@@ -112,7 +73,12 @@ def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes,
     assert page.locator("[data-part=cells] .cell").count() == 4
     assert "of 1,000 generations" in part(page, "eta")
     assert "alpha" in part(page, "workers")
-    record_property("seconds until a killed worker went", gone(page, worker, "alpha"))
+    row = ".workers tr[data-state=present] td:has-text('alpha')"
+    page.wait_for_selector(row, state="attached")
+    began = time.monotonic()
+    worker.popen.kill()
+    page.wait_for_selector(row, state="detached")
+    record_property("seconds until a killed worker went", time.monotonic() - began)
     wait(page, "waiting for workers")
     coordinator.popen.kill()
     wait(page, "coordinator lost since")
@@ -126,54 +92,9 @@ def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes,
     without_absence(page)
 
 
-@pytest.mark.long
-def test_a_killed_worker_goes_from_the_page_within_two_seconds(page, processes, settings):
-    processes.coordinator(*settings, "--generations", 1000)
-    names = [f"host-{number}" for number in range(5)]
-    fleet = [processes.worker("--task", tasks.SLOW_TOY, "--name", name) for name in names]
-    seconds = [gone(page, worker, name) for name, worker in zip(names, fleet, strict=True)]
-    assert median(seconds) < 2, seconds
-
-
-PAINTED = "all => all.every(each => each.getContext('2d').getImageData(each.width - 4, 9, 1, 1).data[3] > 0)"
-
-
 @pytest.mark.slow
-def test_workers_out_of_sight_are_drawn_for_screenshots_and_print(browser, processes):
-    with serving(processes.endpoint, snapshot(workers=60)), dashboard(processes, "--port", 0) as started, \
-            tab(browser, viewport={"width": 1280, "height": 400}) as page:  # fmt: skip
-        page.goto(started.address)
-        page.wait_for_selector(".workers tbody tr:nth-child(60)", state="attached")
-        assert page.eval_on_selector_all(".workers canvas", PAINTED)
-        assert page.eval_on_selector_all(
-            "main *", "all => all.every(each => getComputedStyle(each).contentVisibility === 'visible')"
-        )
-
-
-@pytest.mark.slow
-def test_before_the_first_generation_a_chart_has_no_axes_and_says_what_comes(browser, processes):
-    with serving(processes.endpoint, snapshot(0)), dashboard(processes, "--port", 0) as started, \
-            tab(browser) as page:  # fmt: skip
-        page.goto(started.address)
-        page.wait_for_selector(".placeholder:has-text('Once the first generation closes')")
-        assert page.locator("main svg.main-svg").count() == 0
-
-
-@pytest.mark.slow
-def test_a_run_that_is_paused_says_why_and_one_that_is_left_how_to_go_on(page, processes, settings):
-    coordinator = processes.coordinator(*settings, "--generations", 1000)
-    wait(page, "waiting")
-    assert processes.call("pause", "test", "--connect", processes.endpoint)[0] == 0
-    wait(page, "paused")
-    wait(page, "By hand", "sentence")
-    coordinator.popen.send_signal(signal.SIGTERM)
-    wait(page, "left open")
-    wait(page, "--resume test", "sentence")
-
-
-@pytest.mark.slow
-def test_the_dashboard_may_die_and_come_back(browser, processes, settings):
-    processes.coordinator(*settings, "--generations", 1000)
+def test_the_dashboard_may_die_and_come_back(browser, processes, small):
+    processes.coordinator(*small)
     port = free_port()
     with tab(browser) as page:
         with dashboard(processes, "--port", port) as first:
@@ -198,7 +119,7 @@ def test_hostile_names_and_errors_stay_text(browser, processes):
     status = dataclasses.replace(hostile.status, settings=dataclasses.replace(settings, task=task))
     worker = dataclasses.replace(WORKER, worker=f"{nasty}/0a1b2c3d"[:120], drawn_by="<b>native</b>")
     with serving(processes.endpoint, dataclasses.replace(hostile, status=status, workers=(worker,))), \
-            dashboard(processes, "--port", 0) as started, tab(browser) as page:  # fmt: skip
+            dashboard(processes) as started, tab(browser) as page:  # fmt: skip
         page.on("dialog", lambda dialog: page.said.append(dialog.message))
         page.goto(started.address)
         wait(page, "paused")
@@ -211,7 +132,7 @@ def test_hostile_names_and_errors_stay_text(browser, processes):
 @pytest.mark.slow
 def test_several_live_runs_can_be_chosen_among(browser, processes):
     with serving(processes.endpoint, snapshot(), snapshot(name="lucid")), \
-            dashboard(processes, "--port", 0) as started, tab(browser) as page:  # fmt: skip
+            dashboard(processes) as started, tab(browser) as page:  # fmt: skip
         page.goto(f"{started.address}#/live/night")
         wait(page, "night", "run")
         wait(page, "running")
@@ -229,7 +150,7 @@ def test_past_runs_are_searched_sorted_opened_and_compared_by_keyboard(browser, 
         shutil.copytree(RUNS / name, tmp_path / "runs" / name)
     (tmp_path / "runs" / "broken").mkdir()
     (tmp_path / "runs" / "broken" / "journal.sqlite").write_text("no journal")
-    with dashboard(processes, "--port", 0, runs=tmp_path / "runs") as started, tab(browser) as page:
+    with dashboard(processes, runs=tmp_path / "runs") as started, tab(browser) as page:
         page.goto(f"{started.address}#/runs")
         rows = page.locator("[data-part=rows] tr")
         page.wait_for_selector("[data-part=rows] tr")
@@ -277,19 +198,12 @@ def test_past_runs_are_searched_sorted_opened_and_compared_by_keyboard(browser, 
 
 
 @pytest.mark.slow
-def test_an_empty_runs_folder_says_how_a_run_is_started(page):
-    page.goto(f"{page.address}#/runs")
-    page.wait_for_selector("text=No runs here yet")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("width", "scheme"), [(390, "light"), pytest.param(390, "dark", marks=pytest.mark.long), (1280, "dark")]
-)
+@pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (1280, "dark")])
 def test_it_fits_a_phone_and_follows_the_systems_colours(browser, processes, width, scheme):
-    names = tuple(dataclasses.replace(WORKER, worker=f"{'a-rather-long-host-name-' * 2}{n}/0a1b2c3d") for n in range(3))
-    with serving(processes.endpoint, dataclasses.replace(snapshot(40), workers=names)), \
-            dashboard(processes, "--port", 0) as started, \
+    name = "a-rather-long-host-name-" * 2
+    names = tuple(dataclasses.replace(WORKER, worker=f"{name}{n}/0a1b2c3d") for n in range(60))
+    with serving(processes.endpoint, dataclasses.replace(snapshot(40, workers=60), workers=names)), \
+            dashboard(processes) as started, \
             tab(browser, viewport={"width": width, "height": 844}, color_scheme=scheme) as page:  # fmt: skip
         page.goto(started.address)
         wait(page, "running")
@@ -297,6 +211,8 @@ def test_it_fits_a_phone_and_follows_the_systems_colours(browser, processes, wid
         assert page.evaluate("document.documentElement.scrollWidth") == width
         cut = "all => all.filter(each => each.scrollWidth > each.clientWidth + 1).length"
         assert page.eval_on_selector_all("td.name, h1, .tile b", cut) == 0, "no name is cut"
+        page.wait_for_selector(".workers tbody tr:nth-child(60)", state="attached")
+        assert page.eval_on_selector_all(".workers canvas", PAINTED), "also out of sight, for screenshots and print"
         page_colour = "getComputedStyle(document.documentElement).backgroundColor"
         dark = page.evaluate(page_colour) == "rgb(14, 19, 26)"
         assert dark == (scheme == "dark")
@@ -319,16 +235,6 @@ def test_everything_can_be_reached_by_keyboard_and_the_focus_is_seen(page):
     assert reached == ["Skip to the run", "dreamfleet", "Live", "Runs", "Hosts", "Theme: system"]
 
 
-def moved(fleet, by):
-    """The same workers a moment later."""
-    return tuple(
-        dataclasses.replace(
-            each, steps_per_second=float((7 * n + 13 * by) % 900), leases=(n + by) % 20, finished=by * n
-        )
-        for n, each in enumerate(fleet)
-    )
-
-
 def busy(page):
     """Milliseconds that the page's main thread has worked, as its own clock has it, and updates that it painted."""
     metrics = page.cdp.send("Performance.getMetrics")["metrics"]
@@ -339,7 +245,7 @@ def busy(page):
 @pytest.mark.long
 def test_five_thousand_generations_and_five_hundred_workers_are_painted_in_no_time(browser, processes):
     with serving(processes.endpoint, snapshot(5000, workers=500, population=400)) as served, \
-            dashboard(processes, "--port", 0) as started, tab(browser) as page:  # fmt: skip
+            dashboard(processes) as started, tab(browser) as page:  # fmt: skip
         page.goto(started.address)
         drawn(page, "Generation 4999")
         assert "Every 9th generation is drawn" in part(page, "fitness-caption")
@@ -349,7 +255,9 @@ def test_five_thousand_generations_and_five_hundred_workers_are_painted_in_no_ti
         page.cdp.send("Performance.enable", {"timeDomain": "threadTicks"})
         began, painted = busy(page)
         for by in range(1, 6):
-            served.snapshot = dataclasses.replace(served.snapshot, workers=moved(served.snapshot.workers, by))
+            fleet = enumerate(served.snapshot.workers)
+            moved = [dataclasses.replace(each, steps_per_second=float((7 * n + 13 * by) % 900)) for n, each in fleet]
+            served.snapshot = dataclasses.replace(served.snapshot, workers=tuple(moved))
             page.wait_for_function(  # asked rarely: the question is work of the page's own thread too
                 "since => performance.getEntriesByName('update').length > since", arg=painted + by - 1, polling=200
             )
@@ -363,10 +271,13 @@ def test_another_coordinators_refusal_is_shown_and_ends_nothing(browser, process
     broken = dataclasses.replace(
         strange, status=dataclasses.replace(strange.status, recent=(), generations=2**60, uptime=float("inf"))
     )
-    with serving(processes.endpoint, strange) as served, dashboard(processes, "--port", 0) as started, \
+    with serving(processes.endpoint, snapshot(0)) as served, dashboard(processes) as started, \
             tab(browser) as page:  # fmt: skip
         page.goto(started.address)
-        wait(page, "running")
+        page.wait_for_selector(".placeholder")
+        assert page.locator("main svg.main-svg").count() == 0, "no axes before the first generation"
+        served.snapshot = strange
+        drawn(page, "Generation 2")
         served.snapshot = broken
         wait(page, "lost")
         served.snapshot = strange
@@ -376,7 +287,7 @@ def test_another_coordinators_refusal_is_shown_and_ends_nothing(browser, process
 
 @pytest.mark.slow
 def test_the_token_is_asked_for_and_opens_the_page(browser, processes):
-    with dashboard(processes, "--host", "0.0.0.0", "--port", 0, "--token", TOKEN) as started, tab(browser) as page:
+    with dashboard(processes, "--host", "0.0.0.0", "--token", TOKEN) as started, tab(browser) as page:
         address = started.address.replace("0.0.0.0", "127.0.0.1")
         page.goto(address)
         page.fill("input[name=token]", "not this one")
@@ -401,21 +312,9 @@ def test_what_cannot_be_served_is_one_line(processes):
     assert (code, "'No Run'" in err) == (2, True), err
 
 
-def test_without_its_packages_it_names_the_extra():
-    hidden = (
-        "import sys; sys.modules.update({'plotly': None}); "
-        "from dreamfleet.common.cli.command_line import main; sys.exit(main())"
-    )
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", hidden, "dashboard", "--port", "0"], capture_output=True, text=True, check=False
-    )
-    assert (done.returncode, "dashboard" in done.stderr) == (1, True), done.stderr
-    assert command("dashboard")[-1] == "dashboard"
-
-
 @pytest.mark.slow
 def test_it_leaves_at_once_although_pages_are_open(processes):
-    with dashboard(processes, "--port", 0) as started:
+    with dashboard(processes) as started:
         stream = urllib.request.urlopen(f"{started.address}live", timeout=DEADLINE)
         assert stream.readline().startswith(b"event: hello")
         assert "digest" in json.loads(stream.readline().removeprefix(b"data: "))
@@ -425,9 +324,9 @@ def test_it_leaves_at_once_although_pages_are_open(processes):
             urllib.request.urlopen(started.address, timeout=DEADLINE)
 
 
-def send_to(port, request, deadline=DEADLINE):
+def send_to(port, request):
     """What the server says to these bytes until it closes the connection, or the head alone of what goes on."""
-    with socket.create_connection(("127.0.0.1", port), timeout=deadline) as connection:
+    with socket.create_connection(("127.0.0.1", port), timeout=DEADLINE) as connection:
         connection.sendall(request)
         said = b""
         while b"\r\n\r\n" not in said and (more := connection.recv(65536)):
@@ -437,7 +336,7 @@ def send_to(port, request, deadline=DEADLINE):
 
 @pytest.mark.slow
 def test_clients_that_are_no_browsers_neither_stop_it_nor_see_more(processes):
-    with dashboard(processes, "--port", 0) as started, ExitStack() as stack:
+    with dashboard(processes) as started, ExitStack() as stack:
         port = int(started.address.split(":")[-1].strip("/"))
         host = b"\r\nHost: 127.0.0.1\r\n"
         half = [stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=DEADLINE)) for _ in range(50)]

@@ -1,6 +1,5 @@
 """What fifty open pages cost a run, in alternating blocks with none and with all of them."""
 
-import re
 import socket
 import threading
 import time
@@ -10,8 +9,8 @@ from statistics import median
 import pytest
 
 from dreamfleet.common.client.client import Client
-from dreamfleet.common.host.reports import ADDRESS
 from tests.support import tasks
+from tests.support.browser import dashboard
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(900)]
 PAGES, BLOCKS, SECONDS = 50, 5, 8.0
@@ -47,16 +46,12 @@ def steps_in_a_block(client):
     return (client.status("test").throughput.environment_steps - before) / (time.monotonic() - began)
 
 
-def test_fifty_pages_do_not_slow_a_run(processes, random_bundle):
-    processes.coordinator(
-        "--bundle", random_bundle.path, "--population", 32, "--episodes", 4, "--evaluate-every", 0,
-        "--task", tasks.SLOW_TOY, "--generations", 10**6,
-    )  # fmt: skip
+def test_fifty_pages_do_not_slow_a_run(processes, small):
+    processes.coordinator(*small, "--population", 32, "--episodes", 4)
     processes.worker("--task", tasks.SLOW_TOY)
-    started = processes.start("dashboard", "--connect", processes.endpoint, "--runs-dir", processes.runs, "--port", 0)
-    port = int(re.search(r":(\d+)/", started.wait_for_report(ADDRESS))[1])
     alone, watched = [], []
-    with Client((processes.endpoint,)) as client:
+    with dashboard(processes) as started, Client((processes.endpoint,)) as client:
+        port = int(started.address.strip("/").rpartition(":")[2])
         while client.status("test").generations < 1:
             time.sleep(0.1)
         for _ in range(BLOCKS):

@@ -2,46 +2,27 @@
 
 import os
 import signal
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from dreamfleet.common.host.reports import ADDRESS
 from tests.support import tasks
-from tests.support.browser import PATIENCE, chromium, tab
+from tests.support.browser import dashboard, tab, wait_for_text, wait_until
 
 PICTURE = "[data-part=view-picture]:not([hidden])"
+OTHER = "src => document.querySelector('[data-part=view-picture]').src !== src"
 WHOM = "[data-part=view-whom]"
 HIDE = "hidden => { Object.defineProperty(document, 'hidden', {value: hidden, configurable: true}); " \
        "document.dispatchEvent(new Event('visibilitychange')) }"  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as started:
-        yield started
-
-
 @pytest.fixture
-def run(processes, random_bundle):
+def run(processes, small):
     """A run whose episodes are pictures, with a worker; its coordinator."""
-    coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--population", 3, "--episodes", 1, "--evaluate-every", 1,
-        "--evaluation-episodes", 1, "--task", tasks.PAINTED, "--generations", 1000,
-    )  # fmt: skip
+    often = ("--evaluate-every", 1, "--evaluation-episodes", 1)
+    coordinator = processes.coordinator(*small, "--task", tasks.PAINTED, "--population", 3, *often)
     coordinator.worker = processes.worker("--task", tasks.PAINTED, "--name", "alpha")
     return coordinator
-
-
-@contextmanager
-def dashboard(processes, *flags):
-    started = processes.start(
-        "dashboard", "--connect", processes.endpoint, "--runs-dir", processes.runs, "--port", 0, *flags
-    )
-    started.address = started.wait_for_report(ADDRESS)
-    yield started
-    started.end()
 
 
 def children(process):
@@ -51,10 +32,7 @@ def children(process):
 
 
 def say(page, text, part="view-text"):
-    page.wait_for_function(
-        "([part, text]) => document.querySelector(`[data-part=${part}]`)?.textContent.includes(text)", arg=[part, text],
-        timeout=PATIENCE,
-    )  # fmt: skip
+    wait_for_text(page, text, part)
 
 
 def choose(page, kind):
@@ -65,10 +43,8 @@ def choose(page, kind):
 
 def look(page):
     """Keep the view in sight, while charts above it take their places, until it shows a picture."""
-    page.wait_for_function(
-        "picture => { document.querySelector('[data-part=view]').scrollIntoView({block: 'nearest'}); "
-        "return document.querySelector(picture) }", arg=PICTURE, timeout=PATIENCE,
-    )  # fmt: skip
+    script = "document.querySelector('[data-part=view]').scrollIntoView({block: 'nearest'})"
+    wait_until(page, f"picture => {{ {script}; return document.querySelector(picture) }}", PICTURE)
 
 
 def facts(page):
@@ -87,7 +63,7 @@ def test_pictures_come_with_their_facts_while_somebody_sees_them(browser, proces
         assert facts(page)["worker"].startswith("alpha/")
         assert {"generation", "step", "score so far"} <= facts(page).keys()
         before = page.get_attribute(PICTURE, "src")
-        page.wait_for_function("src => document.querySelector('[data-part=view-picture]').src !== src", arg=before)
+        wait_until(page, OTHER, before)
         other.goto(started.address)
         other.wait_for_selector(PICTURE)
         (only,) = children(started)
@@ -103,17 +79,15 @@ def test_pictures_come_with_their_facts_while_somebody_sees_them(browser, proces
         while children(started):
             page.wait_for_timeout(50)
         page.evaluate(HIDE, False)
-        page.wait_for_function("src => document.querySelector('[data-part=view-picture]').src !== src",
-                               arg=page.get_attribute(PICTURE, "src"))  # fmt: skip
+        wait_until(page, OTHER, page.get_attribute(PICTURE, "src"))
         page.focus("[data-part=view-pause]")
         page.keyboard.press("Enter")
         assert page.inner_text("[data-part=view-pause]") == "Play"
 
 
 @pytest.mark.slow
-def test_a_task_without_pictures_takes_no_room_for_them(browser, processes, random_bundle):
-    processes.coordinator("--bundle", random_bundle.path, "--population", 3, "--episodes", 1, "--evaluate-every", 0,
-                          "--task", tasks.SLOW_TOY, "--generations", 1000)  # fmt: skip
+def test_a_task_without_pictures_takes_no_room_for_them(browser, processes, small):
+    processes.coordinator(*small)
     processes.worker("--task", tasks.SLOW_TOY, "--name", "alpha")
     with dashboard(processes) as started, tab(browser) as page:
         page.goto(started.address)

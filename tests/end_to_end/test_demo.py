@@ -5,7 +5,6 @@ Tests dreamfleet/experiments/demo.py and dreamfleet/experiments/verbs/demo.py.
 
 import os
 import signal
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -108,20 +107,6 @@ def test_what_it_begins_is_of_no_other_fleet(monkeypatch):
     assert joins == [""]
 
 
-def test_killed_it_leaves_nobody_behind(processes, random_bundle):
-    demo = processes.start(
-        "demo", "--run", "demo", "--runs-dir", processes.runs, "--port", processes.port, "--bundle", random_bundle.path,
-        "--workers", 1, "--no-page",
-    )  # fmt: skip
-    while not ((status := processes.status()) and status["workers"]["present"]):
-        assert demo.popen.poll() is None, "".join(demo.lines)
-    begun = Path(f"/proc/{demo.popen.pid}/task/{demo.popen.pid}/children").read_text().split()
-    demo.popen.kill()
-    assert len(begun) == 2
-    while any(_runs(each) for each in begun):
-        time.sleep(0.05)
-
-
 def _runs(pid):
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
@@ -130,7 +115,7 @@ def _runs(pid):
 
 
 @pytest.mark.slow
-def test_without_the_page_none_is_begun(processes, random_bundle):
+def test_stopped_without_a_page_it_had_none_leaves_nobody_and_says_how_to_go_on(processes, random_bundle):
     demo = processes.start(
         "demo", "--run", "demo", "--runs-dir", processes.runs, "--port", processes.port, "--bundle", random_bundle.path,
         "--workers", 1, "--no-page",

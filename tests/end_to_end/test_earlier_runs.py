@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.runs.run_folder import open_run
 
@@ -27,15 +25,6 @@ def runs(processes):
         shutil.copytree(FIXTURES / "runs" / name, processes.runs / name)
         shutil.copyfile(FIXTURES / "small.zip", processes.runs / name / "bundle.zip")
     return processes.runs
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_they_open(runs, name):
-    with open_run(runs, name) as run:
-        assert len(run.history()) == CONTINUED[name]["first"]
-        assert Bundle.open(run.bundle_path).sha256 == run.spec.bundle
-        controller = Controller.load(run.controller_path)
-        assert (controller.task, controller.bundle) == (run.spec.task, run.spec.bundle)
 
 
 @pytest.mark.parametrize("name", NAMES)

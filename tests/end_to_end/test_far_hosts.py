@@ -8,7 +8,7 @@ import random
 import sqlite3
 import statistics
 import subprocess
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 
 import pytest
 
@@ -35,8 +35,8 @@ class FarFleet:
         self._processes = processes
         self._middle, *self._hosts = cables
         port, access = free_port(), processes.folder / "access"
-        self._home = Relay(port, far=self._middle.own)
-        self._relays = [Relay(port, host.address, far=self._middle.own) for host in self._hosts]
+        near = ["127.0.0.1", *(each.address for each in self._hosts)]
+        self.links = [Relay(port, address, far=self._middle.own) for address in near]
         authority = Authority.create(access)
         authority.issue("router", "middle", access / "router.join", hosts=[host.address for host in self._hosts])
         authority.issue("coordinator", "home", access / "home.join")
@@ -45,21 +45,17 @@ class FarFleet:
         processes.start("router", "--join", access / "router.join", "--listen", f"tls/{self._middle.own}:{port}",
                         inside=self._middle.inside).wait_for_event("begin")  # fmt: skip
 
-    @property
-    def links(self):
-        return (self._home, *self._relays)
-
     def begin(self, name, *settings):
-        coordinator = self._processes.start(
-            "coordinator", "--run", name, "--runs-dir", self._processes.runs, "--join", self._access / "home.join",
-            "--connect", f"tls/127.0.0.1:{self._home.port}", *settings,
-        )  # fmt: skip
-        coordinator.wait_for_event("begin")
-        for number, (host, relay) in enumerate(zip(self._hosts, self._relays, strict=True)):
-            self._processes.start(
-                "worker", "--join", self._access / "lab.join", "--connect", f"tls/{host.address}:{relay.port}",
-                "--run", name, "--name", f"h{number}", "--slots", SLOTS, "--task", *TASKS, inside=host.inside,
+        home, *links = self.links
+        at = ("--join", self._access / "home.join", "--connect", f"tls/127.0.0.1:{home.port}")
+        coordinator = self._processes.coordinator(*settings, name=name, at=at)
+        for number, (host, link) in enumerate(zip(self._hosts, links, strict=True)):
+            self._processes.worker(
+                "--join", self._access / "lab.join", "--run", name, "--name", f"h{number}", "--slots", SLOTS, "--task",
+                *TASKS, endpoint=f"tls/{host.address}:{link.port}", inside=host.inside,
             )  # fmt: skip
+        for each in self.links:
+            each.delay = DELAY
         return coordinator
 
     def close(self):
@@ -91,26 +87,18 @@ def test_links_that_are_slow_and_cut_at_random_cost_no_bit(processes):
                 "--generations", generations, "--seed", 5)  # fmt: skip
     chance, cuts = random.Random(11), 0
     with far_fleet(processes) as fleet:
-        coordinator = fleet.begin("far", "--beat", 0.2, *settings)
-        for link in fleet.links:
-            link.delay = DELAY
+        coordinator = fleet.begin("far", *settings)
         coordinator.wait_for_event("generation", number=0, timeout=PATIENCE)
         while coordinator.popen.poll() is None:
             chance.choice(fleet.links).cut()
             cuts += 1
-            wait_for_end(coordinator, chance.uniform(0.5, 3.0))
+            with suppress(subprocess.TimeoutExpired):
+                coordinator.popen.wait(chance.uniform(0.5, 3.0))
         assert coordinator.finish(PATIENCE)[0] == 0, "".join(coordinator.lines[-5:])
     assert begin_near(processes, "alone", *settings).finish(PATIENCE)[0] == 0
     assert outcome(processes, "far") == outcome(processes, "alone")
     log.info("%d cuts while %d jobs were scored", cuts, generations * population * 2)
     assert cuts >= 10
-
-
-def wait_for_end(process, seconds):
-    try:
-        process.popen.wait(seconds)
-    except subprocess.TimeoutExpired:
-        return
 
 
 def efficiency(processes, name):
@@ -131,9 +119,7 @@ def test_jobs_of_a_second_keep_slots_behind_slow_links_as_busy_as_on_one_host(tm
             assert begin_near(processes, "near", *settings).finish(PATIENCE)[0] == 0
             near.append(efficiency(processes, "near"))
         with processes_in(tmp_path / f"far-{block}") as processes, far_fleet(processes) as fleet:
-            for link in fleet.links:
-                link.delay = DELAY
-            assert fleet.begin("far", "--beat", 0.2, *settings).finish(PATIENCE)[0] == 0
+            assert fleet.begin("far", *settings).finish(PATIENCE)[0] == 0
             far.append(efficiency(processes, "far"))
     ratio = statistics.median(b / a for a, b in zip(near, far, strict=True))
     log.info("busy: here %s, far %s; median ratio %.3f", *(", ".join(f"{each:.3f}" for each in one)

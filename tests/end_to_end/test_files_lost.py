@@ -1,7 +1,6 @@
 """A live run whose files are removed, replaced or moved: nothing is lost, it says so soon, and it can be continued.
 Tests coordinator/storage/file_watch.py and coordinator/storage/served_bundle.py."""
 
-import errno
 import os
 import shlex
 import shutil
@@ -13,54 +12,18 @@ from contextlib import closing
 
 import pytest
 
-from dreamfleet.common.errors import NotWritableNowError, write_error
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
 from tests.support.processes import DEADLINE, environment, free_port, started
 
 
 @pytest.fixture
-def settings(random_bundle):
-    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 1, "--evaluate-every", 0,
-            "--task", tasks.SLOW_TOY, "--generations", 100_000)  # fmt: skip
-
-
-@pytest.fixture
-def live(processes, settings):
+def live(processes, small):
     """A run in its third generation, and its folder."""
-    coordinator = processes.coordinator(*settings)
+    coordinator = processes.coordinator(*small)
     processes.worker("--task", tasks.SLOW_TOY)
     coordinator.wait_for_event("generation", number=1)
     return coordinator, processes.runs / "test"
-
-
-def said_of(coordinator):
-    """How it ended, which is not as if nothing had happened."""
-    code, _ = coordinator.finish()
-    assert code == 1
-    assert "Traceback" not in "".join(coordinator.lines)
-    return coordinator.lines[-1]
-
-
-def closed(coordinator):
-    """How many generations its output reports as closed."""
-    return len(coordinator.events("generation"))
-
-
-def goes_on(processes, coordinator, said, name="test"):
-    """The command that the error names continues the run, with its worker and every generation that was reported."""
-    generations = closed(coordinator)
-    command = said[said.index(sys.executable) :].strip()
-    with started(
-        [*shlex.split(command), "--generations", str(generations + 1), "--listen", processes.endpoint],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(processes.cache),
-    ) as again:  # fmt: skip
-        _, err = again.communicate(timeout=DEADLINE)
-        assert again.returncode == 0, err
-    with open_run(processes.runs, name) as run:
-        history = [(each.number, each.mean) for each in run.history()]
-    assert [(each["number"], each["mean"]) for each in coordinator.events("generation")] == history[:-1]
-    assert len(history) == generations + 1
 
 
 def remove(*names):
@@ -89,10 +52,20 @@ def test_what_is_lost_is_rescued_and_goes_on_where_the_error_says(processes, liv
     harm(folder)
     strange = folder / "journal.sqlite"
     kept = strange.read_bytes() if strange.exists() else None
-    said = said_of(coordinator)
+    assert coordinator.finish()[0] == 1
+    assert "Traceback" not in "".join(coordinator.lines)
     if harm is replace_by_copy:
         assert strange.read_bytes() == kept, "what somebody put there stays"
-    goes_on(processes, coordinator, said, name)
+    reported = [(each["number"], each["mean"]) for each in coordinator.events("generation")]
+    said = coordinator.lines[-1]
+    command = shlex.split(said[said.index(sys.executable) :])
+    command += ["--generations", str(len(reported) + 1), "--listen", processes.endpoint]
+    with started(command, stderr=subprocess.PIPE, text=True, env=environment(processes.cache)) as again:
+        _, err = again.communicate(timeout=DEADLINE)
+        assert again.returncode == 0, err
+    with open_run(processes.runs, name) as run:
+        history = [(each.number, each.mean) for each in run.history()]
+    assert (history[:-1], len(history)) == (reported, len(reported) + 1)
 
 
 @pytest.mark.slow
@@ -103,7 +76,7 @@ def test_who_reads_the_journal_or_empties_its_log_is_no_reason_to_leave(processe
             reader.execute("SELECT count(*) FROM result").fetchone()
             reader.execute(f"PRAGMA {checkpoint}")
     assert processes.call("runs", "show", "test", "--runs-dir", processes.runs)[0] == 0
-    coordinator.wait_for_event("generation", times=closed(coordinator) + 2)
+    coordinator.wait_for_event("generation", times=len(coordinator.events("generation")) + 2)
     assert coordinator.popen.poll() is None
 
 
@@ -112,8 +85,7 @@ def test_a_bundle_that_is_removed_is_served_on_and_written_again(processes, live
     coordinator, folder = live
     (folder / "bundle.zip").unlink()
     coordinator.wait_for_event("bundle written")
-    worker = processes.start("worker", "--connect", processes.endpoint, "--slots", "1", "--task", tasks.SLOW_TOY)
-    worker.wait_for_event("joined")
+    processes.worker("--task", tasks.SLOW_TOY).wait_for_event("joined")
     assert coordinator.popen.poll() is None
     assert (folder / "bundle.zip").exists()
 
@@ -128,8 +100,7 @@ def test_a_controller_whose_name_is_a_folder_is_a_clear_error(processes, live):
     assert "controller.npz" in coordinator.lines[-1]
     assert "Traceback" not in "".join(coordinator.lines)
     (folder / "controller.npz").rmdir()
-    generations = closed(coordinator)
-    again = processes.resume("test", "--generations", generations)
+    again = processes.resume("test", "--generations", len(coordinator.events("generation")))
     assert again.finish()[0] == 0
 
 
@@ -137,15 +108,5 @@ def test_a_controller_whose_name_is_a_folder_is_a_clear_error(processes, live):
 def test_a_lock_that_is_removed_by_hand_lets_nobody_in(processes, live):
     coordinator, folder = live
     (folder / "lock").unlink()
-    code, *_ = processes.call("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--listen",
-                                  f"tcp/127.0.0.1:{free_port()}")  # fmt: skip
-    assert code != 0
+    assert processes.resume("test", "--listen", f"tcp/127.0.0.1:{free_port()}").finish()[0] != 0
     coordinator.wait_for_event("generation")
-
-
-@pytest.mark.parametrize("kind", ["folder", "other"])
-def test_a_controller_that_cannot_be_written_is_not_a_full_disk(kind):
-    code = {"folder": errno.EISDIR, "other": errno.EIO}[kind]
-    error = write_error("controller.npz", OSError(code, os.strerror(code)))
-    assert not isinstance(error, NotWritableNowError)
-    assert isinstance(write_error("controller.npz", OSError(errno.ENOSPC, "")), NotWritableNowError)

@@ -83,13 +83,11 @@ def write_controller(path, task, bundle=None, options=None):
     shape = bundle.controller_shape if bundle else ControllerShape(4, 2)
     parameters = np.zeros(shape.size, np.float32)
     text = json.dumps(options) if options else ""
-    Controller(shape, parameters, task, bundle.sha256 if bundle else "", receipt(task), text).save(path)
+    Controller(
+        shape, parameters, task, bundle.sha256 if bundle else "", {"generation": 1, "steps": 1, "run_uid": "ab"}, text
+    ).save(path)
     if bundle:
         shutil.copy(bundle.path, path.parent / "bundle.zip")
-
-
-def receipt(task):
-    return {"generation": 1, "steps": 1, "run_uid": "ab"}
 
 
 def write_run(folder, bundle, **names):
@@ -99,11 +97,8 @@ def write_run(folder, bundle, **names):
     with closing(sqlite3.connect(folder / "journal.sqlite")) as journal, journal:
         (text,) = journal.execute("SELECT value FROM run WHERE key = 'settings'").fetchone()
         settings = json.loads(text)
-        settings["task"] |= {"bundle": bundle.sha256}
-        if "task" in names:
-            settings["task"]["task"] = names["task"]
-        if "optimiser" in names:
-            settings["optimiser"] = names["optimiser"]
+        task = {name: value for name, value in names.items() if name == "task"}
+        settings |= names | {"task": settings["task"] | {"bundle": bundle.sha256} | task}
         journal.execute("UPDATE run SET value = ? WHERE key = 'settings'", (json.dumps(settings),))
         journal.execute("DELETE FROM run WHERE key = 'ended'")
     kept = Controller.load(folder / "controller.npz")

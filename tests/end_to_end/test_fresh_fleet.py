@@ -20,7 +20,7 @@ from dreamfleet.common.security.credentials import read_join_file
 from dreamfleet.common.transport.session import Network
 from dreamfleet.coordinator.addons.spawn.parcel import pack_wheel
 from tests.support.hosts import new_host, require_hosts
-from tests.support.processes import free_port
+from tests.support.processes import free_port, until
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(1800)]
 log = logging.getLogger(__name__)
@@ -108,13 +108,13 @@ def test_three_hosts_score_soon_after_one_command_and_another_leaves_nothing(
         stack.callback(newcomer.end)
         newcomer.start("coordinator", "--run", "far", "--runs-dir", tmp_path / "runs", "--listen", *endpoints,
                        *(("--join", tmp_path / "home.join") if secured else ("--insecure",)))  # fmt: skip
-        await_that(lambda: status(network), "the coordinator does not come up")
+        until(lambda: status(network), "the coordinator")
 
         began = time.monotonic()
         up = newcomer.rows("spawn", "--hosts", file)
         printed_after = time.monotonic() - began
-        await_that(lambda: status(network).slots == len(NAMES) * SLOTS, "the fleet is not whole")
-        await_that(lambda: status(network).throughput.environment_steps, "nobody scores")
+        until(lambda: status(network).slots == len(NAMES) * SLOTS, "the whole fleet")
+        until(lambda: status(network).throughput.environment_steps, "a score")
         took = time.monotonic() - began
         log.info(
             "%s, %s: up %.0f s, scoring after %.0f s", source, "joined" if secured else "open", printed_after, took
@@ -132,10 +132,3 @@ def status(network):
             return client.status()
     except DreamfleetError:
         return None
-
-
-def await_that(happens, why):
-    deadline = time.monotonic() + PATIENCE
-    while not happens():
-        assert time.monotonic() < deadline, why
-        time.sleep(0.1)

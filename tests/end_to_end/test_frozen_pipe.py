@@ -3,12 +3,13 @@
 import os
 import signal
 import subprocess
+from contextlib import ExitStack
 
 import pytest
 
 from dreamfleet.common.host.processes import command
 from tests.support import tasks
-from tests.support.processes import DEADLINE, environment
+from tests.support.processes import DEADLINE, environment, started
 
 WORKER = ("worker", "--slots", 1, "--task")
 
@@ -30,67 +31,51 @@ def brimful():
 @pytest.fixture
 def frozen(processes):
     """Start a verb nobody reads the words of: on stderr, or also what it answers on stdout."""
-    started, ends = [], []
+    with ExitStack() as stack:
 
-    def start(*words, stdout=False):
-        read, write = brimful()
-        ends.extend((read, write))
-        popen = subprocess.Popen(
-            command(*words), env=environment(processes.cache), stdin=subprocess.DEVNULL,
-            stdout=write if stdout else subprocess.DEVNULL, stderr=write,
-        )  # fmt: skip
-        started.append(popen)
-        return popen
+        def start(*words, stdout=False):
+            read, write = brimful()
+            for end in (read, write):
+                stack.callback(os.close, end)
+            out = write if stdout else subprocess.DEVNULL
+            how = {"env": environment(processes.cache), "stdin": subprocess.DEVNULL, "stdout": out, "stderr": write}
+            return stack.enter_context(started(command(*words), **how))
 
-    yield start
-    for popen in started:
-        popen.kill()
-        popen.wait()
-    for end in ends:
-        os.close(end)
+        yield start
 
 
-def coordinator(processes, bundle, task, generations, *more):
-    return (
-        "coordinator", "--run", "test", "--runs-dir", processes.runs, "--listen", processes.endpoint, "--beat", "0.2",
-        "--bundle", bundle.path, "--task", task, "--population", 4, "--evaluate-every", 0, "--generations", generations,
-        "--log-level", "debug", *more,
-    )  # fmt: skip
+@pytest.fixture
+def run(processes, small):
+    """The words that begin a run that says much."""
+    where = ("--run", "test", "--runs-dir", processes.runs, "--listen", processes.endpoint, "--beat", 0.2)
+    return ("coordinator", *where, *small, "--log-level", "debug")
 
 
 @pytest.mark.slow
-def test_a_run_ends_although_nobody_reads_what_its_processes_log(processes, random_bundle, frozen):
-    run = frozen(*coordinator(processes, random_bundle, tasks.TOY, 5))
-    worker = frozen(*WORKER, tasks.TOY, "--connect", processes.endpoint, "--exit-when-done", "--log-level", "debug")
-    assert run.wait(DEADLINE) == 0
-    assert worker.wait(DEADLINE) == 0
-
-
-@pytest.mark.slow
-def test_a_task_that_prints_without_end_scores_although_nobody_reads_it(processes, random_bundle, frozen):
-    run = frozen(*coordinator(processes, random_bundle, tasks.CHATTY, 2))
+def test_a_task_that_prints_without_end_scores_although_nobody_reads_it(processes, run, frozen):
+    coordinator = frozen(*run, "--task", tasks.CHATTY, "--generations", 2)
     frozen(*WORKER, tasks.CHATTY, "--connect", processes.endpoint, stdout=True)
-    assert run.wait(DEADLINE) == 0
+    assert coordinator.wait(DEADLINE) == 0
 
 
 @pytest.mark.slow
-def test_who_is_not_read_still_hears_that_it_shall_leave(processes, random_bundle, frozen):
-    run = frozen(*coordinator(processes, random_bundle, tasks.SLOW_TOY, 1000, "--episodes", 1))
+def test_who_is_not_read_still_hears_that_it_shall_leave(processes, run, frozen):
+    coordinator = frozen(*run)
     worker = frozen(*WORKER, tasks.SLOW_TOY, "--connect", processes.endpoint)
     while not (status := processes.status()) or status["generations"] < 1:
         pass
     worker.send_signal(signal.SIGTERM)
     assert worker.wait(DEADLINE) == 0
-    run.send_signal(signal.SIGTERM)
-    assert run.wait(DEADLINE) == 130
+    coordinator.send_signal(signal.SIGTERM)
+    assert coordinator.wait(DEADLINE) == 130
 
 
 @pytest.mark.slow
-def test_an_answer_that_nobody_reads_waits_and_a_signal_ends_it(processes, random_bundle, frozen):
-    run = frozen(*coordinator(processes, random_bundle, tasks.TOY, 1, "--json"), stdout=True)
+def test_an_answer_that_nobody_reads_waits_and_a_signal_ends_it(processes, run, frozen):
+    coordinator = frozen(*run, "--task", tasks.TOY, "--generations", 1, "--json", stdout=True)
     worker = frozen(*WORKER, tasks.TOY, "--connect", processes.endpoint, "--exit-when-done")
     assert worker.wait(DEADLINE) == 0, "the run has ended"
     with pytest.raises(subprocess.TimeoutExpired):
-        run.wait(2)
-    run.send_signal(signal.SIGTERM)
-    assert run.wait(DEADLINE) == -signal.SIGTERM
+        coordinator.wait(2)
+    coordinator.send_signal(signal.SIGTERM)
+    assert coordinator.wait(DEADLINE) == -signal.SIGTERM

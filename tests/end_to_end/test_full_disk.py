@@ -1,6 +1,5 @@
 """A disk that fills up in the middle of a run."""
 
-import os
 import shutil
 import sqlite3
 import subprocess
@@ -11,57 +10,62 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
-from tests.support import tasks
+from tests.support import disks, tasks
 
-DRIVES = 30
+DRIVES, GENERATIONS = 30, 40
 FILE_CHECK = 1.0  # seconds between two looks at the files
 ROOM = 900_000  # bytes: for a while of journal, and not for a drive
 
 
 @pytest.fixture
-def small_disk(tmp_path):
-    """A file system of 19 MB, of which the world model's copy takes 14."""
-    if os.geteuid() != 0:
-        pytest.skip("only root can mount a small disk")
-    place = tmp_path / "disk"
-    place.mkdir()
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=19m", "tmpfs", place], check=False).returncode:
-        pytest.skip("this host does not let us mount")
-    yield place
-    subprocess.run(["umount", "--lazy", place], check=True)
+def small_disk(processes):
+    """The run's folder as a file system of 8 MB."""
+    roomy = processes.runs
+    with disks.small_disk(roomy.with_name("disk"), 8) as disk:
+        if disk is None:
+            pytest.skip("mounting a small disk needs root")
+        processes.runs = disk.path
+        yield disk.path
+        processes.runs = roomy
 
 
-def resize(place, size):
-    subprocess.run(["mount", "-o", f"remount,size={size}", place], check=True)
+def remount(place, option):
+    subprocess.run(["mount", "-o", f"remount,{option}", place], check=True)
+
+
+@pytest.fixture
+def fast(small):
+    return (*small, "--task", tasks.TOY, "--population", 64, "--generations", GENERATIONS)
+
+
+def history(folder):
+    with open_run(folder, "test") as run:
+        return [(each.number, each.mean) for each in run.history()]
 
 
 @pytest.mark.slow
-def test_a_run_on_a_full_disk_waits_and_goes_on_by_itself_to_the_same_bits(processes, random_bundle, small_disk):
-    flags = ("--task", tasks.TOY, "--population", 64, "--episodes", 1, "--evaluate-every", 0, "--generations", 40)
-    processes.runs = small_disk
-    full = processes.coordinator("--bundle", random_bundle.path, *flags, name="small")
-    processes.worker("--task", tasks.TOY, "--run", "small")
+def test_a_run_on_a_full_disk_waits_and_goes_on_by_itself_to_the_same_bits(processes, fast, small_disk):
+    full = processes.coordinator(*fast)
+    worker = processes.worker("--task", tasks.TOY)
     full.wait_for_event("paused")
     status = processes.status()
     assert status["state"] == "paused"
-    assert 0 < status["generations"] < 40
-    resize(small_disk, 200 << 20)
+    assert 0 < status["generations"] < GENERATIONS
+    remount(small_disk, "size=200m")
     full.wait_for_event("written")
     assert full.finish()[0] == 0
-
-    processes.runs = small_disk.parent / "roomy"
-    whole = processes.coordinator("--bundle", random_bundle.path, *flags, name="whole")
-    processes.worker("--task", tasks.TOY, "--run", "whole")
+    worker.end()
+    found = history(small_disk)
+    processes.runs = processes.folder / "roomy"
+    whole = processes.coordinator(*fast)
+    processes.worker("--task", tasks.TOY)
     assert whole.finish()[0] == 0
-    with open_run(small_disk, "small") as one, open_run(processes.runs, "whole") as other:
-        history = [(each.number, each.mean) for each in one.history()]
-        assert history == [(each.number, each.mean) for each in other.history()]
+    assert found == history(processes.runs)
 
 
 @pytest.mark.slow
-def test_a_run_whose_journal_is_locked_waits_and_goes_on(processes, random_bundle):
-    flags = ("--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 1, "--evaluate-every", 0, "--generations", 12)
-    locked = processes.coordinator("--bundle", random_bundle.path, *flags)
+def test_a_run_whose_journal_is_locked_waits_and_goes_on(processes, small):
+    locked = processes.coordinator(*small, "--generations", 6)
     processes.worker("--task", tasks.SLOW_TOY)
     locked.wait_for_event("generation", number=0)
     with closing(sqlite3.connect(processes.runs / "test" / "journal.sqlite", timeout=60)) as other:
@@ -74,45 +78,33 @@ def test_a_run_whose_journal_is_locked_waits_and_goes_on(processes, random_bundl
     locked.wait_for_event("written")
     assert locked.finish()[0] == 0
     assert not locked.events("clock")
-    with open_run(processes.runs, "test") as run:
-        assert len(run.history()) == 12
+    assert len(history(processes.runs)) == 6
 
 
 @pytest.mark.slow
-def test_a_coordinator_that_is_killed_while_it_waits_for_room_loses_nothing(processes, random_bundle, small_disk):
-    flags = ("--task", tasks.TOY, "--population", 64, "--episodes", 1, "--evaluate-every", 0, "--generations", 40)
-    processes.runs = small_disk
-    full = processes.coordinator("--bundle", random_bundle.path, *flags, name="small")
-    processes.worker("--task", tasks.TOY, "--run", "small")
+def test_a_coordinator_that_is_killed_while_it_waits_for_room_loses_nothing(processes, fast, small_disk):
+    full = processes.coordinator(*fast)
+    processes.worker("--task", tasks.TOY)
     full.wait_for_event("paused")
     full.end()
-    resize(small_disk, 200 << 20)
-    again = processes.start(
-        "coordinator", "--resume", "small", "--runs-dir", small_disk, "--listen", processes.endpoint,
-        "--beat", "0.2", "--generations", 40,
-    )  # fmt: skip
-    assert again.finish()[0] == 0
-    with open_run(small_disk, "small") as run:
-        assert len(run.history()) == 40
+    remount(small_disk, "size=200m")
+    assert processes.resume().finish()[0] == 0
+    assert len(history(small_disk)) == GENERATIONS
 
 
 @pytest.mark.slow
-def test_a_disk_that_fills_while_a_drive_is_written_keeps_every_drive_whole(processes, random_bundle, small_disk):
-    flags = (
-        "--task", tasks.HEAVY, "--population", 4, "--episodes", 1, "--evaluate-every", 0, "--generations", 1,
-        "--collect-every", 1, "--collect-episodes", DRIVES,
-    )  # fmt: skip
-    processes.runs = small_disk
-    resize(small_disk, 200 << 20)
-    full = processes.coordinator("--bundle", random_bundle.path, *flags, name="small")
-    processes.worker("--task", tasks.HEAVY, "--run", "small")
+def test_a_disk_that_fills_while_a_drive_is_written_keeps_every_drive_whole(processes, small, small_disk):
+    remount(small_disk, "size=200m")
+    collected = ("--collect-every", 1, "--collect-episodes", DRIVES)
+    full = processes.coordinator(*small, "--task", tasks.HEAVY, "--generations", 1, *collected)
+    processes.worker("--task", tasks.HEAVY)
     full.wait_for_event("generation", number=0)
-    resize(small_disk, shutil.disk_usage(small_disk).used + ROOM)
+    remount(small_disk, f"size={shutil.disk_usage(small_disk).used + ROOM}")
     full.wait_for_event("paused")
-    assert not list((small_disk / "small" / "rollouts").glob(".*")), "no half of a drive stays"
-    resize(small_disk, 200 << 20)
+    assert not list((small_disk / "test" / "rollouts").glob(".*")), "no half of a drive stays"
+    remount(small_disk, "size=200m")
     assert full.finish()[0] == 0
-    with open_run(small_disk, "small") as run:
+    with open_run(small_disk, "test") as run:
         assert len(run.rollouts()) == DRIVES
         for path in run.rollouts():
             with np.load(path) as drive:
@@ -120,18 +112,15 @@ def test_a_disk_that_fills_while_a_drive_is_written_keeps_every_drive_whole(proc
 
 
 @pytest.mark.long
-def test_a_run_on_a_disk_without_inodes_waits_and_goes_on_by_itself(processes, random_bundle, small_disk):
-    flags = ("--task", tasks.SLOW_TOY, "--population", 4, "--episodes", 1, "--evaluate-every", 0, "--generations", 12)
-    processes.runs = small_disk
-    resize(small_disk, "40m")  # room for the write-ahead log: only inodes are short
-    full = processes.coordinator("--bundle", random_bundle.path, *flags, name="small")
+def test_a_run_on_a_disk_without_inodes_waits_and_goes_on_by_itself(processes, small, small_disk):
+    remount(small_disk, "size=40m")  # room for the write-ahead log: only inodes are short
+    full = processes.coordinator(*small, "--generations", 12)
     processes.worker("--task", tasks.SLOW_TOY)
     full.wait_for_event("generation", number=0)
     used = sum(1 for _ in small_disk.rglob("*")) + 1
-    subprocess.run(["mount", "-o", f"remount,nr_inodes={used}", small_disk], check=True)
+    remount(small_disk, f"nr_inodes={used}")
     full.wait_for_event("paused")
-    subprocess.run(["mount", "-o", "remount,nr_inodes=1000", small_disk], check=True)
+    remount(small_disk, "nr_inodes=1000")
     full.wait_for_event("written")
     assert full.finish()[0] == 0
-    with open_run(small_disk, "small") as run:
-        assert len(run.history()) == 12
+    assert len(history(small_disk)) == 12

@@ -9,15 +9,10 @@ from dreamfleet.common.runs.run_folder import open_run
 from tests.support import checkpoint_files
 
 
-@pytest.fixture(scope="module")
-def imported(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("exp_dir")
-    checkpoint_files.write_checkpoints(folder, checkpoint_files.random_weights())
-    return folder
-
-
 @pytest.mark.slow
-def test_a_run_goes_on_from_a_controller_of_ctallec(processes, imported, tmp_path):
+def test_a_run_goes_on_from_a_controller_of_ctallec_and_another_in_its_dream(processes, tmp_path):
+    imported = tmp_path / "exp_dir"
+    checkpoint_files.write_checkpoints(imported, checkpoint_files.random_weights())
     world, controller = tmp_path / "world.zip", tmp_path / "controller.npz"
     for command in ((imported, "--out", world), (imported / "ctrl", "--bundle", world, "--out", controller)):
         found = processes.call("import", *command)
@@ -34,13 +29,7 @@ def test_a_run_goes_on_from_a_controller_of_ctallec(processes, imported, tmp_pat
     judged = processes.call("evaluate", "--controller", controller, "--bundle", world, "--episodes", 1, "--json")
     assert judged[0] == 0, judged
     assert isinstance(json.loads(judged[1])["mean"], float), judged
-
-
-@pytest.mark.slow
-def test_controllers_are_evolved_in_its_dream(processes, imported, tmp_path):
-    world = tmp_path / "world.zip"
-    assert processes.call("import", imported, "--out", world)[0] == 0
-    few = ("--population", 4, "--episodes", 1, "--horizon", 20, "--evaluate-every", 0, "--generations", 2)
-    coordinator = processes.coordinator("--task", "dream", "--bundle", world, "--variant", "actions=linear", *few)
-    processes.worker("--exit-when-done")
+    dreamt = ("--task", "dream", "--bundle", world, "--variant", "actions=linear")
+    coordinator = processes.coordinator(*dreamt, *few, name="dreamt")
+    processes.worker("--run", "dreamt", "--exit-when-done")
     assert coordinator.finish()[0] == 0

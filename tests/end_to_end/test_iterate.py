@@ -8,7 +8,6 @@ import shutil
 import signal
 import time
 from pathlib import Path
-from threading import Event
 
 import numpy as np
 import pytest
@@ -30,7 +29,7 @@ from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
 from tests.support.drives import write_drives
-from tests.support.processes import DEADLINE, call_here, processes_in
+from tests.support.processes import call_here, processes_in, until
 from tests.support.tables import cells
 from tests.support.variants import controller_of
 
@@ -56,6 +55,13 @@ def words(folder, *more):
     return ("iterate", "--data", folder, *SMALL, *more)
 
 
+def until_exists(path, process):
+    """Wait for a file; a process that ends meanwhile ends the waiting."""
+    while not path.exists():
+        assert process.popen.poll() is None, process.lines
+        time.sleep(0.01)  # it works on this core too
+
+
 def hashes(layout):
     """Of all that follows from the settings. A run's files name it, a checkpoint's head has its words in any order."""
     made = [each for entry in IterationLedger.load(layout.ledger).entries for each in entry.made]
@@ -75,15 +81,6 @@ def left(folder):
         if str(folder) in line and int(path.parent.name) != os.getpid():
             found.append(line)
     return found
-
-
-def until(true, process=None):
-    """Look until it is so; a process that ends meanwhile ends the waiting."""
-    deadline = time.monotonic() + DEADLINE
-    while not true():
-        assert time.monotonic() < deadline, "it never came to be"
-        assert process is None or process.popen.poll() is None, process.lines
-        Event().wait(0.01)  # it works on this core too
 
 
 @pytest.fixture(scope="module")
@@ -115,17 +112,6 @@ def test_each_round_makes_a_model_from_all_drives_and_evolves_in_its_dream(undis
     assert [tuple(line.split()[1:3]) for line in lines] == [(str(number), name) for number, name in PHASES]
 
 
-@pytest.mark.long
-def test_a_rounds_dreams_may_begin_where_its_drives_were(processes):
-    layout = IterationFolder(processes.folder / "data")
-    flags = ("--rounds", 1, "--drive-steps", 24, "--run-flags", f"{RUN} --recorded 0.5")
-    code, _, err = processes.call(*words(layout.root, *flags))
-    assert code == 0, err
-    assert Bundle.open(layout.bundle(1)).recorded_count == 3 * 4, "all that lies behind each drive's first steps"
-    with open_run(layout.runs, layout.run_name(1)) as run:
-        assert (run.spec.task, run.spec.recorded) == ("dream", 0.5)
-
-
 def test_the_encoder_stays_and_what_evolved_drives_for_the_next_model(undisturbed):
     layout, _, _ = undisturbed
     one, two = (Bundle.open(layout.bundle(number)) for number in (1, 2))
@@ -140,15 +126,11 @@ def test_the_encoder_stays_and_what_evolved_drives_for_the_next_model(undisturbe
         pilot = Controller.load(layout.means(1) / f"{row}.npz")
         assert (pilot.parameters == vector).all()
         assert pilot.bundle == one.sha256
-    (asked,) = IterationLedger.load(layout.ledger).entry(2, "drive").requests
+    ledger = IterationLedger.load(layout.ledger)
+    (asked,) = ledger.entry(2, "drive").requests
     assert asked["settings"]["noise"] == 0.3
     assert asked["controllers"] == [str(layout.means(1) / f"{row}.npz") for row in range(2)]
-
-
-def test_a_gate_that_can_measure_nothing_refuses_nothing_and_says_so(undisturbed):
-    layout, _, _ = undisturbed
-    gate = IterationLedger.load(layout.ledger).entry(2, "gate")
-    assert gate.figures["kept"]
+    assert ledger.entry(2, "gate").figures["kept"], "a gate that can measure nothing refuses nothing"
     answer = json.loads(layout.gate_file(2).read_text())
     assert answer["old"] == answer["new"]
     assert answer["new"]["probe"]["failed"]
@@ -163,19 +145,20 @@ def gate(layout, new, drives=write_drives, **changes):
         shutil.copyfile(source, place)
     drives(layout.root)
     config = IterateConfig(**changes)
-    ledger = (
-        IterationLedger.begin(config, {})
-        .add(FinishedPhase(1, "bundle", 0, 0.0, ""))
-        .add(FinishedPhase(2, "bundle", 0, 0.0, ""))
-    )
+    ledger = IterationLedger.begin(config, {})
+    for number in (1, 2):
+        ledger = ledger.add(FinishedPhase(number, "bundle", 0, 0.0, ""))
     phases = PhaseRunner(Requests(config, layout, ledger), None, never_stop, print)
     return phases.do(Phase(2, "gate")).figures
 
 
-def test_a_model_that_knows_clearly_less_is_refused(tmp_path):
+def ignorant(folder):
     small = {"vae": VAEConfig(latent=2, channels=(2, 2, 2, 2)), "rnn": MDNRNNConfig(latent=2, hidden=2)}
-    ignorant = write_random_bundle(tmp_path / "ignorant.zip", **small)
-    figures = gate(IterationFolder(tmp_path / "data"), ignorant.path, gate_drives=3, gate_losses=0)
+    return write_random_bundle(folder / "ignorant.zip", **small).path
+
+
+def test_a_model_that_knows_clearly_less_is_refused(tmp_path):
+    figures = gate(IterationFolder(tmp_path / "data"), ignorant(tmp_path), gate_drives=3, gate_losses=0)
     assert not figures["kept"]
     assert figures["old"]["knows"]["value"] > 0.4 > figures["new"]["knows"]["value"]
     assert figures["why"].endswith(" knows")
@@ -183,9 +166,7 @@ def test_a_model_that_knows_clearly_less_is_refused(tmp_path):
 
 def test_a_driver_that_cannot_be_fitted_leaves_losses_unmeasured(tmp_path):
     layout = IterationFolder(tmp_path / "data")
-    small = {"vae": VAEConfig(latent=2, channels=(2, 2, 2, 2)), "rnn": MDNRNNConfig(latent=2, hidden=2)}
-    ignorant = write_random_bundle(tmp_path / "ignorant.zip", **small)
-    figures = gate(layout, ignorant.path, drives=lost_drives, gate_drives=0, gate_losses=4)
+    figures = gate(layout, ignorant(tmp_path), drives=lost_drives, gate_drives=0, gate_losses=4)
     assert figures["kept"]
     assert " 2 " in layout.gate_file(2).read_text(), "how many drives it has, none of which stays on its road"
     assert not layout.refitted(2).exists()
@@ -364,26 +345,21 @@ BEGUN = {
 }  # fmt: skip
 
 
-def disturb(processes, layout, phases):
-    """Kill an iteration in the middle of each of these phases and as each is finished, and let it end."""
-    for phase in phases:
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_killed_in_every_phase_it_goes_on_to_the_same_models(undisturbed, processes):
+    """In the middle of each phase, and as each is finished."""
+    whole, _, _ = undisturbed
+    layout = IterationFolder(processes.folder / "data")
+    for phase in PHASES:
         process = processes.start(*words(layout.root))
-        until(lambda phase=phase: (layout.root / BEGUN[phase]).exists(), process)
+        until_exists(layout.root / BEGUN[phase], process)
         kill(process, layout)
         process = processes.start(*words(layout.root))
         process.wait_for(f"round {phase.round}  {phase.name} ")
         kill(process, layout)
-    code, out, err = processes.call(*words(layout.root, "--json"))
+    code, _, err = processes.call(*words(layout.root))
     assert code == 0, err
-    return json.loads(out)
-
-
-@pytest.mark.long
-@pytest.mark.timeout(1800)
-def test_killed_in_every_phase_it_goes_on_to_the_same_models(undisturbed, processes):
-    whole, _, _ = undisturbed
-    layout = IterationFolder(processes.folder / "data")
-    disturb(processes, layout, PHASES)
     assert hashes(layout) == hashes(whole)
     assert list(IterationLedger.load(layout.ledger).finished) == PHASES
 
@@ -391,7 +367,7 @@ def test_killed_in_every_phase_it_goes_on_to_the_same_models(undisturbed, proces
 def test_one_iteration_works_in_a_folder_and_ctrl_c_ends_all_that_it_started(processes):
     layout = IterationFolder(processes.folder / "data")
     process = processes.start(*words(layout.root))
-    until((layout.root / "episodes").exists, process)
+    until_exists(layout.root / "episodes", process)
     code, _, err = processes.call(*words(layout.root))
     assert code == 2
     assert str(layout.root) in err

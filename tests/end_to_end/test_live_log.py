@@ -13,21 +13,13 @@ from tests.support import tasks
 from tests.support.events import scalars
 
 
-def followers(process):
-    """The processes that a coordinator started to write curves."""
-    children = Path(f"/proc/{process.popen.pid}/task/{process.popen.pid}/children").read_text().split()
-    return [int(each) for each in children if "spawn_main" in Path(f"/proc/{each}/cmdline").read_text()]
-
-
 @pytest.mark.slow
-def test_curves_go_on_after_a_kill_and_stall_nothing(processes, random_bundle, monkeypatch):
-    """The last of three lives stops its follower, which holds up neither generations nor, for long, the run's end."""
+def test_curves_go_on_after_a_kill_and_stall_nothing(processes, small, monkeypatch):
     monkeypatch.setenv("DREAMFLEET_NETWORK_LOG_TO", "tensorboard")
-    settings = ("--bundle", random_bundle.path, "--population", 4, "--episodes", 1, "--evaluate-every", 5,
-                "--evaluation-episodes", 2, "--task", tasks.TOY)  # fmt: skip
     processes.worker("--task", tasks.TOY)
     board = processes.runs / "test" / "tensorboard"
-    life = processes.coordinator(*settings, "--generations", 100000)
+    judged = ("--evaluate-every", 5, "--evaluation-episodes", 2)
+    life = processes.coordinator(*small, "--task", tasks.TOY, *judged)
     monkeypatch.delenv("DREAMFLEET_NETWORK_LOG_TO")  # the run keeps the setting
     for _ in range(2):
         while not any(len(points) > 3 for points in scalars(board).values()):
@@ -46,11 +38,11 @@ def test_curves_go_on_after_a_kill_and_stall_nothing(processes, random_bundle, m
     assert found == wanted
 
 
-def test_a_follower_that_stands_still_holds_up_no_generation(processes, random_bundle, monkeypatch):
+def test_a_follower_that_stands_still_holds_up_no_generation(processes, small, monkeypatch):
     monkeypatch.setenv("DREAMFLEET_NETWORK_LOG_TO", "tensorboard")
-    life = processes.coordinator("--bundle", random_bundle.path, "--population", 4, "--episodes", 1,
-                                 "--evaluate-every", 0, "--task", tasks.TOY, "--generations", 100000)  # fmt: skip
-    (follower,) = followers(life)
+    life = processes.coordinator(*small, "--task", tasks.TOY)
+    children = Path(f"/proc/{life.popen.pid}/task/{life.popen.pid}/children").read_text().split()
+    (follower,) = [int(each) for each in children if "spawn_main" in Path(f"/proc/{each}/cmdline").read_text()]
     os.kill(follower, signal.SIGSTOP)
     processes.worker("--task", tasks.TOY)
     life.wait_for_event("generation", times=20)

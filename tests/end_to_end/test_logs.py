@@ -14,11 +14,8 @@ from tests.support.served import snapshot
 
 
 @pytest.mark.slow
-def test_a_json_log_is_json_and_says_how_to_start_a_worker(processes, random_bundle):
-    coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
-        "--task", tasks.TOY, "--generations", 100000, "--log-format", "auto",
-    )  # fmt: skip
+def test_a_json_log_is_json_and_says_how_to_start_a_worker(processes, small):
+    coordinator = processes.coordinator(*small, "--task", tasks.TOY, "--log-format", "auto")
     record = coordinator.wait_for_event("no worker")
     program, *words = shlex.split(record["command"])
     assert program == "dreamfleet"
@@ -31,16 +28,13 @@ def test_a_json_log_is_json_and_says_how_to_start_a_worker(processes, random_bun
 
 
 @pytest.mark.slow
-def test_an_orderly_end_is_not_logged_as_a_loss(processes, random_bundle):
-    coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
-        "--task", tasks.TOY, "--generations", 100000,
-    )  # fmt: skip
-    leaves = "--exit-when-done", "--coordinator-timeout", 1
-    own, drained = (processes.worker("--task", tasks.TOY, "--name", name, *more)
-                    for name, more in (("own", leaves), ("drained", ())))  # fmt: skip
-    own.wait_for_event("joined", run="test")
-    drained.wait_for_event("joined", run="test")
+def test_an_orderly_end_is_not_logged_as_a_loss(processes, small):
+    coordinator = processes.coordinator(*small, "--task", tasks.TOY)
+    leaves = ("--exit-when-done", "--coordinator-timeout", 1)
+    own = processes.worker("--task", tasks.TOY, "--name", "own", *leaves)
+    drained = processes.worker("--task", tasks.TOY, "--name", "drained")
+    for each in (own, drained):
+        each.wait_for_event("joined", run="test")
     coordinator.wait_for_event("generation", number=0)
     drained.popen.terminate()
     assert coordinator.wait_for_event("left")["worker"].startswith("drained/")
@@ -55,11 +49,8 @@ def test_an_orderly_end_is_not_logged_as_a_loss(processes, random_bundle):
 
 
 @pytest.mark.slow
-def test_the_events_of_a_killed_workers_jobs_are_printed_while_the_run_lives(processes, random_bundle):
-    coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--population", 4, "--episodes", 1, "--evaluate-every", 0,
-        "--task", tasks.SLOW_TOY, "--generations", 100000,
-    )  # fmt: skip
+def test_the_events_of_a_killed_workers_jobs_are_printed_while_the_run_lives(processes, small):
+    coordinator = processes.coordinator(*small)
     worker = processes.worker("--task", tasks.SLOW_TOY, "--name", "host-a")
     coordinator.wait_for_event("generation", number=0)
     worker.popen.kill()
@@ -85,7 +76,7 @@ def test_the_events_of_a_killed_workers_jobs_are_printed_while_the_run_lives(pro
 
 
 @pytest.mark.slow
-def test_a_coordinator_from_before_stories_is_said_to_be_old_and_not_absent(processes):
+def test_a_coordinator_that_answers_with_its_status_alone_is_not_called_absent(processes):
     status = encode_part(snapshot(), "", {}.get)
     with open_session(Network(listen=(processes.endpoint,))) as session:
         key = keys.status("night")

@@ -8,8 +8,10 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from dreamfleet.common.host.reports import ADDRESS
 from tests.support import tasks
-from tests.support.processes import DEADLINE, free_port
+from tests.support.processes import DEADLINE, call_here, free_port
 from tests.support.served import serving, snapshot
+
+TOKEN = "correct horse battery"
 
 
 def read(port, path="/metrics"):
@@ -19,10 +21,9 @@ def read(port, path="/metrics"):
 
 
 @pytest.mark.slow
-def test_a_coordinator_answers_prometheus_and_a_taken_port_is_one_line(processes, random_bundle):
+def test_a_coordinator_answers_prometheus_and_a_taken_port_is_one_line(processes, small):
     port = free_port()
-    settings = ("--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
-                "--task", tasks.TOY, "--generations", 100000, "--metrics-port", port)  # fmt: skip
+    settings = (*small, "--task", tasks.TOY, "--metrics-port", port)
     coordinator = processes.coordinator(*settings)
     assert read(port)["dreamfleet_generation"].value == 0
     processes.worker("--task", tasks.TOY, "--name", "host-a")
@@ -33,28 +34,21 @@ def test_a_coordinator_answers_prometheus_and_a_taken_port_is_one_line(processes
     with pytest.raises(urllib.error.HTTPError, match="404"):
         read(port, "/")
     other = f"tcp/127.0.0.1:{free_port()}"
-    code, _, err = processes.call("coordinator", "--run", "other", "--runs-dir", processes.runs, "--listen", other,
-                                  *settings)  # fmt: skip
-    assert code == 1
-    assert str(port) in err
-    assert "Traceback" not in err
-
-
-@pytest.mark.parametrize("wrong", ["none", "0", "host:", "70000"])
-def test_a_port_that_is_none_is_said_at_once(processes, wrong):
-    code, _, err = processes.call("coordinator", "--run", "test", "--runs-dir", processes.runs, "--metrics-port", wrong)
-    assert (code, "--metrics-port" in err) == (2, True), err
+    new = ("coordinator", "--run", "other", "--runs-dir", processes.runs, "--listen", other)
+    code, _, err = processes.call(*new, *settings)
+    assert (code, str(port) in err, "Traceback" in err) == (1, True, False), err
+    for wrong in ("none", "0", "host:", "70000"):
+        code, _, err = call_here(*new, "--metrics-port", wrong)
+        assert (code, "--metrics-port" in err) == (2, True), err
 
 
 def test_the_dashboard_answers_for_every_live_run_to_holders_of_the_token(processes):
     with serving(processes.endpoint, snapshot(workers=80), snapshot(name="lucid")):
-        page = processes.start(
-            "dashboard", "--connect", processes.endpoint, "--port", 0, "--token", "correct horse battery"
-        )
+        page = processes.start("dashboard", "--connect", processes.endpoint, "--port", 0, "--token", TOKEN)
         address = page.wait_for_report(ADDRESS)
         with pytest.raises(urllib.error.HTTPError, match="401"):
             urllib.request.urlopen(f"{address}metrics", timeout=DEADLINE)
-        asked = urllib.request.Request(f"{address}metrics", headers={"Authorization": "Bearer correct horse battery"})
+        asked = urllib.request.Request(f"{address}metrics", headers={"Authorization": f"Bearer {TOKEN}"})
         with urllib.request.urlopen(asked, timeout=DEADLINE) as answer:
             text = answer.read().decode()
     found = {each.name: each.samples for each in text_string_to_metric_families(text)}

@@ -13,20 +13,14 @@ from tests.support import tasks
 from tests.support.processes import DEADLINE, call_here, environment, free_port
 
 
-@pytest.fixture
-def settings(random_bundle):
-    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 1, "--evaluate-every", 0,
-            "--task", tasks.SLOW_TOY)  # fmt: skip
-
-
 def history(folder, name="test"):
     with open_run(folder, name) as run:
         return [(each.number, each.mean, each.best, each.sigma) for each in run.history()]
 
 
-def stopped(processes, settings, *flags):
-    """A run that was stopped in its third generation, and what it said last."""
-    coordinator = processes.coordinator(*settings, *flags)
+def stopped(processes, *flags):
+    """A run that was stopped in its third generation: its worker, and what it said last."""
+    coordinator = processes.coordinator(*flags)
     worker = processes.worker("--task", tasks.SLOW_TOY)
     coordinator.wait_for_event("generation", number=1)
     coordinator.popen.send_signal(signal.SIGTERM)
@@ -35,46 +29,46 @@ def stopped(processes, settings, *flags):
 
 
 @pytest.mark.slow
-def test_the_hint_of_a_run_that_was_left_is_a_whole_command_with_its_limits_and_its_network(processes, settings):
+def test_the_hint_of_a_run_that_was_left_is_a_whole_command_with_its_limits_and_its_network(processes, small):
     processes.runs = processes.folder / "all my runs"
-    worker, said = stopped(processes, settings, "--generations", 6, "--strict")
-    command = said[said.index(sys.executable) :]
-    done = subprocess.run(
-        command, shell=True, env=environment(processes.cache), capture_output=True, check=False, text=True,
-        timeout=DEADLINE,
-    )  # fmt: skip
+    worker, said = stopped(processes, *small, "--generations", 4, "--strict")
+    command, env = said[said.index(sys.executable) :], environment(processes.cache)
+    done = subprocess.run(command, shell=True, env=env, capture_output=True, check=False, timeout=DEADLINE)
     assert done.returncode == 0, done.stderr
     assert worker.popen.poll() is None
     with open_run(processes.runs, "test") as run:
-        assert json.loads(run.fact("limits")) == {"generations": 6}
+        assert json.loads(run.fact("limits")) == {"generations": 4}
         assert json.loads(run.fact("network")) == {"listen": [processes.endpoint], "beat": 0.2, "strict": True}
 
 
 @pytest.mark.slow
-def test_what_is_given_as_a_run_goes_on_is_stronger_and_is_kept(processes, settings):
-    stopped(processes, settings, "--generations", 60, "--minutes", 30)
+def test_what_is_given_as_a_run_goes_on_is_stronger_and_is_kept_but_for_what_is_frozen(processes, small):
+    stopped(processes, *small, "--generations", 60, "--minutes", 30)
+    file = processes.folder / "fleet.toml"
+    file.write_text("[run]\npopulation = 64\nepisodes = 1\n")  # of another run
     elsewhere = f"tcp/127.0.0.1:{free_port()}"
-    again = processes.resume("test", "--listen", elsewhere, "--generations", 3)
+    again = processes.resume("test", "--listen", elsewhere, "--generations", 3, "--config", file)
     processes.worker("--task", tasks.SLOW_TOY, endpoint=elsewhere)
+    again.wait_for_event("kept", setting="population")
     assert again.finish()[0] == 0
+    assert not again.events("kept", setting="episodes")
     with open_run(processes.runs, "test") as run:
         assert json.loads(run.fact("limits")) == {"generations": 3, "minutes": 30}
         assert json.loads(run.fact("network")) == {"listen": [elsewhere], "beat": 0.2}
     code, out, _ = call_here("coordinator", "--resume", "test", "--runs-dir", processes.runs, "--json")
-    assert code == 0
-    assert json.loads(out)["ended"] == "3 generations"
+    assert (code, json.loads(out)["ended"]) == (0, "3 generations")
 
 
 @pytest.mark.slow
-def test_a_run_moves_to_another_place_and_its_worker_follows(processes, settings):
+def test_a_run_moves_to_another_place_and_its_worker_follows(processes, small):
     """The worker is given both addresses; the folder is all that moves."""
-    whole = processes.coordinator(*settings[:-1], tasks.TOY, "--generations", 5, name="whole")
+    whole = processes.coordinator(*small, "--task", tasks.TOY, "--generations", 4, name="whole")
     with_it = processes.worker("--task", tasks.TOY, "--run", "whole")
     assert whole.finish()[0] == 0
     with_it.end()
 
     first, second = processes.endpoint, f"tcp/127.0.0.1:{free_port()}"
-    parts = processes.coordinator(*settings, "--generations", 5, name="parts")
+    parts = processes.coordinator(*small, "--generations", 4, name="parts")
     worker = processes.start("worker", "--connect", first, second, "--slots", 1, "--task", tasks.SLOW_TOY)
     parts.wait_for_event("generation", number=1)
     parts.popen.send_signal(signal.SIGTERM)
@@ -104,16 +98,4 @@ def test_one_file_serves_coordinator_worker_and_status(processes, random_bundle)
     worker = processes.start("worker", "--config", path, "--task", tasks.TOY)
     assert coordinator.finish()[0] == 0
     assert worker.finish()[0] == 0
-    code, out, _ = call_here("runs", "list", "--config", path)
-    assert "\nfiled " in out
-
-
-@pytest.mark.slow
-def test_a_file_that_speaks_of_another_run_does_not_keep_this_one_from_going_on(processes, settings):
-    stopped(processes, settings, "--generations", 3)
-    path = processes.folder / "fleet.toml"
-    path.write_text("[run]\npopulation = 64\nepisodes = 1\n")
-    again = processes.resume("test", "--config", path)
-    again.wait_for_event("kept", setting="population")
-    assert again.finish()[0] == 0
-    assert not again.events("kept", setting="episodes")
+    assert "\nfiled " in call_here("runs", "list", "--config", path)[1]

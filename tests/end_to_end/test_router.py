@@ -15,21 +15,19 @@ from tests.support.hosts import new_host, require_hosts
 from tests.support.processes import free_port, processes_in
 from tests.support.same_bits import outcome
 
+ANY = "0.0.0.0:7447"
 RECIPES = Path(__file__).parents[2] / "deploy" / "zenoh"
-GENERATIONS, POPULATION = 5, 4
-SETTINGS = ("--population", POPULATION, "--episodes", 1, "--generations", GENERATIONS, "--evaluate-every", 0,
-            "--beat", 0.2, "--task")  # fmt: skip
 
 
 @pytest.fixture
 def recipe(tmp_path):
     """Writes a recipe's file with the addresses of this test in place of its examples."""
 
-    def write(name, **addresses):
+    def write(name, addresses):
         text = (RECIPES / name).read_text()
         for example, address in addresses.items():
-            assert example.replace("_", ".") in text
-            text = text.replace(example.replace("_", "."), address)
+            assert example in text
+            text = text.replace(example, address)
         (tmp_path / name).write_text(text)
         return tmp_path / name
 
@@ -37,29 +35,30 @@ def recipe(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory, random_bundle):
+def settings(small):
+    return (*small, "--beat", 0.2, "--generations", 4)
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory, settings):
     """What the run comes to where nothing stands between."""
     with processes_in(tmp_path_factory.mktemp("alone")) as processes:
-        coordinator = processes.coordinator("--bundle", random_bundle.path, *SETTINGS, tasks.TOY, name="alone")
+        coordinator = processes.coordinator(*settings, "--task", tasks.TOY, name="alone")
         processes.worker("--run", "alone", "--task", tasks.TOY)
         assert coordinator.finish()[0] == 0
         return outcome(processes, "alone")
 
 
 @pytest.mark.slow
-def test_two_linked_routers_one_of_which_is_killed_cost_no_bit(processes, recipe, random_bundle, alone):
-    ports = {"router": free_port(), "second": free_port()}
-    first = recipe("one.toml", **{"0_0_0_0:7447": f"127.0.0.1:{ports['router']}",
-                                  "router_example:7447": f"127.0.0.1:{ports['router']}"})  # fmt: skip
-    second = recipe("linked.toml", **{"0_0_0_0:7447": f"127.0.0.1:{ports['second']}",
-                                      "router_example:7447": f"127.0.0.1:{ports['router']}",
-                                      "second_example:7447": f"127.0.0.1:{ports['second']}"})  # fmt: skip
+def test_two_linked_routers_one_of_which_is_killed_cost_no_bit(processes, recipe, settings, alone):
+    one, two = (f"127.0.0.1:{free_port()}" for _ in range(2))
+    first = recipe("one.toml", {ANY: one, "router.example:7447": one})
+    second = recipe("linked.toml", {ANY: two, "router.example:7447": one, "second.example:7447": two})
     linked = processes.start("router", "--config", second)  # either may start first
     linked.wait_for_event("begin")
     router = processes.start("router", "--config", first)
     router.wait_for_event("begin")
-    coordinator = processes.start("coordinator", "--config", first, "--run", "far", "--runs-dir", processes.runs,
-                                  "--bundle", random_bundle.path, *SETTINGS, tasks.SLOW_TOY)  # fmt: skip
+    coordinator = processes.coordinator(*settings, name="far", at=("--config", first))
     worker = processes.start("worker", "--config", second, "--run", "far", "--task", tasks.SLOW_TOY, "--slots", 1)
     worker.wait_for_event("joined")
     coordinator.wait_for_event("generation", number=1)
@@ -75,19 +74,19 @@ def test_two_linked_routers_one_of_which_is_killed_cost_no_bit(processes, recipe
 
 @pytest.mark.slow
 def test_a_coordinator_that_nobody_reaches_meets_workers_of_another_network_at_a_router(
-    processes, recipe, random_bundle, alone
+    processes, recipe, settings, alone
 ):
     """Each on a cable of its own to the router's host, which passes no packets on."""
     with new_host() as inside, new_host() as elsewhere:
         require_hosts(inside, elsewhere)
-        near = [recipe("one.toml", **{"0_0_0_0:7447": f"127.0.0.1:{processes.port}",
-                                      "router_example:7447": f"{host.address}:{processes.port}"}).rename(
-                    processes.folder / f"{host.name}.toml") for host in (inside, elsewhere)]  # fmt: skip
-        listen = [f"tcp/{host.address}:{processes.port}" for host in (inside, elsewhere)]
+        near, own = [], {ANY: f"127.0.0.1:{processes.port}"}
+        addresses = [f"{host.address}:{processes.port}" for host in (inside, elsewhere)]
+        for number, address in enumerate(addresses):
+            file = recipe("one.toml", {**own, "router.example:7447": address})
+            near.append(file.rename(processes.folder / f"{number}.toml"))
+        listen = [f"tcp/{address}" for address in addresses]
         processes.start("router", "--insecure", "--listen", *listen).wait_for_event("begin")
-        coordinator = processes.start("coordinator", "--config", near[0], "--run", "nat", "--runs-dir", processes.runs,
-                                      "--bundle", random_bundle.path, *SETTINGS, tasks.SLOW_TOY,
-                                      inside=inside.inside)  # fmt: skip
+        coordinator = processes.coordinator(*settings, name="nat", at=("--config", near[0]), inside=inside.inside)
         worker = processes.start("worker", "--config", near[1], "--run", "nat", "--task", tasks.SLOW_TOY, "--slots", 2,
                                  inside=elsewhere.inside)  # fmt: skip
         worker.wait_for_event("joined")

@@ -7,23 +7,17 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from contextlib import suppress
-from pathlib import Path
 
 import pytest
 
 from dreamfleet.common.addons.access.authority import Authority
 from dreamfleet.coordinator.addons.spawn.agent import process_start
-from dreamfleet.coordinator.addons.spawn.parcel import pack_wheel
 from tests.support import tasks
 from tests.support.disks import small_disk
-from tests.support.hosts import new_host, require_hosts
-from tests.support.processes import DEADLINE
+from tests.support.processes import until
 from tests.support.spawned import rows_of, words
 from tests.support.sshd import closed_port, new_key
 
-BARE = "/usr/local/bin:/usr/bin:/bin"  # where no dreamfleet is installed
 TOY = ("--task", tasks.TOY, "--population", 4, "--episodes", 1, "--evaluate-every", 0)
 
 
@@ -37,44 +31,33 @@ def write_file(processes, hosts, *names, more=""):
     return path
 
 
-def state(host, name=None):
-    return json.loads((host.root() / "workers" / (name or host.name) / "worker.json").read_text())
-
-
-def await_that(happens, why):
-    deadline = time.monotonic() + DEADLINE
-    while not happens():
-        assert time.monotonic() < deadline, why
-        time.sleep(0.1)
-
-
-def runs(pid):
-    return bool(process_start(pid))  # a dead process whose parent has not heard of it runs no more
+def pid_on(host):
+    return json.loads((host.root() / "workers" / host.name / "worker.json").read_text())["pid"]
 
 
 @pytest.mark.slow
 def test_up_brings_hosts_to_a_run_again_leaves_them_and_down_leaves_nothing(processes, hosts):
     a, b = hosts.add("a"), hosts.add("b")
-    coordinator = processes.coordinator(*TOY, "--generations", 10**6)
+    coordinator = processes.coordinator(*TOY)
     file = write_file(processes, hosts, "a", "b", more="tunnel = false")
     assert {row["state"] for row in rows_of(processes, "spawn", "--hosts", file, "--check").values()} == {"ready"}
     assert not a.root().exists()
 
     first = rows_of(processes, "spawn", "--hosts", file)
-    assert {name: row["state"] for name, row in first.items()} == {"a": "started", "b": "started"}
-    pids = [state(host)["pid"] for host in (a, b)]
+    assert [row["state"] for row in first.values()] == ["started"] * 2
+    pids = [pid_on(host) for host in (a, b)]
     coordinator.wait_for_event("generation", number=1)
-    await_that(lambda: processes.status()["slots"] == 2, "two workers never joined")
+    until(lambda: processes.status()["slots"] == 2)
 
     again = rows_of(processes, "spawn", "--hosts", file)
     assert {row["state"] for row in again.values()} == {"running"}
-    assert [state(host)["pid"] for host in (a, b)] == pids
+    assert [pid_on(host) for host in (a, b)] == pids
     file.write_text(file.read_text().replace("slots = 1", "slots = 2", 1))
     changed = rows_of(processes, "spawn", "--hosts", file)
     assert {name: row["state"] for name, row in changed.items()} == {"a": "replaced", "b": "running"}
 
     assert {row["state"] for row in rows_of(processes, "down", "--hosts", file).values()} == {"left"}
-    assert not any(runs(pid) for pid in pids)
+    assert not any(process_start(pid) for pid in pids)
     assert [list(host.home.iterdir()) for host in (a, b)] == [[], []]
     assert {row["state"] for row in rows_of(processes, "down", "a", "b", "--ssh", hosts.ssh).values()} == {"nothing"}
 
@@ -82,11 +65,11 @@ def test_up_brings_hosts_to_a_run_again_leaves_them_and_down_leaves_nothing(proc
 @pytest.mark.slow
 def test_through_a_tunnel_workers_serve_a_coordinator_on_loopback_and_end_with_the_command(processes, hosts):
     a = hosts.add("a")
-    coordinator = processes.coordinator(*TOY, "--generations", 10**6)
+    coordinator = processes.coordinator(*TOY)
     spawn = ("spawn", "a", "--connect", processes.endpoint, *words(hosts, "--worker-flags", f"--task {tasks.TOY}"))
     command = processes.start(*spawn)
     command.wait_for_event("tunnels")
-    pid = state(a)["pid"]
+    pid = pid_on(a)
     coordinator.wait_for_event("generation", number=1)
 
     refused = rows_of(processes, *spawn, code=1)["a"]
@@ -96,21 +79,21 @@ def test_through_a_tunnel_workers_serve_a_coordinator_on_loopback_and_end_with_t
     code, out = command.finish()
     assert code == 0, "".join(command.lines)
     assert "left" in out
-    assert not runs(pid)
+    assert not process_start(pid)
     assert not (a.root() / "workers" / "a").exists()
 
     command = processes.start(*spawn)
     command.wait_for_event("tunnels")
-    pid = state(a)["pid"]
+    pid = pid_on(a)
     command.popen.kill()
     os.killpg(command.popen.pid, signal.SIGKILL)
-    await_that(lambda: not (a.root() / "workers" / "a").exists(), "the worker outlives its tunnel")
-    assert not runs(pid)
+    until(lambda: not (a.root() / "workers" / "a").exists())
+    assert not process_start(pid)
 
 
 @pytest.mark.slow
 def test_a_log_is_followed_until_the_worker_ends_or_somebody_has_seen_enough(processes, hosts):
-    a, coordinator = hosts.add("a"), processes.coordinator(*TOY, "--generations", 10**6)
+    a, coordinator = hosts.add("a"), processes.coordinator(*TOY)
     flags = ("--connect", processes.endpoint, "--no-tunnel", "--follow")
     # The worker outlives its coordinator until the second command follows it: another one would wait for ever.
     own = ("--worker-flags", f"--task {tasks.TOY} --exit-when-done --coordinator-timeout 15")
@@ -118,7 +101,7 @@ def test_a_log_is_followed_until_the_worker_ends_or_somebody_has_seen_enough(pro
     coordinator.wait_for_event("generation", number=1)
     command.popen.send_signal(signal.SIGINT)
     assert command.finish()[0] == 0, "".join(command.lines)
-    assert runs(state(a)["pid"])
+    assert process_start(pid_on(a))
 
     command = processes.start("spawn", "a", *words(hosts, *flags, *own))
     coordinator.popen.send_signal(signal.SIGTERM)
@@ -134,9 +117,9 @@ def test_two_commands_at_once_start_one_worker(processes, hosts):
     both = [processes.start("spawn", "--hosts", file, "--json") for _ in range(2)]
     states = [json.loads(each.finish()[1])["hosts"][0]["state"] for each in both]
     assert sorted(states) == ["running", "started"]
-    pid = state(a)["pid"]
+    pid = pid_on(a)
     rows_of(processes, "down", "--hosts", file, "--now")
-    assert not runs(pid)
+    assert not process_start(pid)
 
 
 @pytest.fixture
@@ -180,7 +163,7 @@ def test_ctrl_c_while_hosts_are_brought_up_ends_the_command_and_not_what_others_
     slow.write_text(f'#!/bin/sh\n[ "$1" = -c ] && exit 0\ntouch {asked}\nexec cat > /dev/null\n')
     slow.chmod(0o755)
     command = processes.start("spawn", "a", "--ssh", hosts.ssh, "--remote-python", slow)
-    await_that(asked.exists, "the host was never asked")
+    until(asked.exists)
     command.popen.send_signal(signal.SIGINT)
     assert command.finish()[0] == 130
 
@@ -217,56 +200,6 @@ def test_a_worker_that_ends_at_once_says_why_and_a_number_in_anothers_hands_is_l
     rows_of(processes, "down", "a", *words(hosts), "--now")
     assert bystander.popen.poll() is None
     assert list(a.home.iterdir()) == []
-
-
-@pytest.mark.long
-@pytest.mark.timeout(1800)
-def test_three_hosts_install_from_wheels_alone_one_of_them_after_it_was_killed_at_that(processes, hosts, tmp_path):
-    house = tmp_path / "house"
-    wheel = pack_wheel(native=True)
-    (tmp_path / wheel.name).write_bytes(wheel.data)
-    subprocess.run(
-        [sys.executable, "-m", "pip", "download", "--quiet", "--dest", house, f"{tmp_path / wheel.name}[worker]"],
-        check=True,
-    )
-    with new_host() as x, new_host() as y, new_host() as z:
-        require_hosts(x, y, z)
-        cables = {"x": x, "y": y, "z": z}
-        there = [
-            hosts.add(name, address=cable.own, inside=cable.inside, path=BARE, modules="")
-            for name, cable in cables.items()
-        ]
-        near = [f"tcp/{cable.address}:{processes.port}" for cable in cables.values()]
-        coordinator = processes.start("coordinator", "--run", "far", "--runs-dir", processes.runs, "--insecure",
-                                      "--listen", *near)  # fmt: skip
-        file = tmp_path / "hosts.toml"
-        listed = ", ".join(f'"{each}"' for each in near)
-        rows = "".join(f'[[host]]\naddress = "{name}"\nslots = 1\n' for name in cables)
-        file.write_text(f'connect = [{listed}]\n[spawn]\nssh = "{hosts.ssh}"\nwheelhouse = "{house}"\n{rows}')
-
-        interrupted = processes.start("spawn", "--hosts", file)
-        await_that(lambda: pip_of(there[0]) is not None, "pip never ran")
-        pip, agent = pip_of(there[0])
-        os.kill(agent, signal.SIGKILL)
-        os.kill(pip, signal.SIGKILL)
-        code, out = interrupted.finish(900)
-        assert (code, "`ssh x`" in out) == (1, True)
-
-        found = rows_of(processes, "spawn", "--hosts", file, patience=900)
-        assert {name: row["state"] for name, row in found.items()} == {"x": "started", "y": "running", "z": "running"}
-        coordinator.wait_for_event("generation", number=1, timeout=600)
-        rows_of(processes, "down", "--hosts", file, patience=900)
-        assert [list(host.home.iterdir()) for host in there] == [[], [], []]
-
-
-def pip_of(host):
-    """The numbers of the pip that runs on a host, and of what started it."""
-    for path in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):
-            words = (path / "cmdline").read_bytes().split(b"\0")
-            if str(host.home).encode() in words[0] and b"install" in words:
-                return int(path.name), int((path / "stat").read_text().rpartition(")")[2].split()[1])
-    return None
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import signal
 import numpy as np
 import pytest
 
-from dreamfleet.common.artifacts.controller import Controller, ControllerShape
+from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
 
@@ -14,20 +14,17 @@ SIGMA = 0.01
 
 
 @pytest.fixture
-def settings(random_bundle):
-    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 1, "--evaluate-every", 0,
-            "--sigma0", SIGMA, "--task", tasks.TOY, "--generations", 1)  # fmt: skip
+def settings(small):
+    return (*small, "--sigma0", SIGMA, "--task", tasks.TOY, "--generations", 1)
 
 
 @pytest.fixture
 def controller(random_bundle, tmp_path):
     """Parameters far away from zero."""
-    size = random_bundle.default_shape.size
-    parameters = np.linspace(1, 2, size, dtype=np.float32)
-    shape = ControllerShape(**vars(random_bundle.default_shape))
-    path = tmp_path / "start.npz"
-    Controller(shape, parameters, tasks.TOY, random_bundle.sha256).save(path)
-    return path
+    shape = random_bundle.default_shape
+    controller = Controller(shape, np.linspace(1, 2, shape.size, dtype=np.float32), tasks.TOY, random_bundle.sha256)
+    controller.save(tmp_path / "start.npz")
+    return tmp_path / "start.npz"
 
 
 def killed(processes, *words):

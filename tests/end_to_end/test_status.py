@@ -17,26 +17,17 @@ from tests.support import tasks
 from tests.support.processes import call_here
 
 
-@pytest.fixture
-def settings(random_bundle):
-    return ("--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0)
-
-
-def lines(out):
-    return [json.loads(line) for line in out.splitlines()]
-
-
 @pytest.mark.slow
-def test_watchers_print_each_change_and_at_last_how_the_run_ended(processes, settings):
+def test_watchers_print_each_change_and_at_last_how_the_run_ended(processes, small):
     watch = ("status", "--connect", processes.endpoint, "--watch")
     watcher = processes.start(*watch, "--json")
     watcher.wait_for(processes.endpoint)
-    coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 2)
+    coordinator = processes.coordinator(*small, "--generations", 2)
     panel = processes.start(*watch)
     processes.worker("--task", tasks.SLOW_TOY)
     assert coordinator.finish()[0] == 0
     (code, out), shown = watcher.finish(), panel.finish()
-    seen = lines(out)
+    seen = [json.loads(line) for line in out.splitlines()]
     assert code == 0
     assert (seen[-1]["state"], seen[-1]["why"], seen[-1]["generations"]) == ("ended", "2 generations", 2)
     assert len(seen) > 1
@@ -47,8 +38,9 @@ def test_watchers_print_each_change_and_at_last_how_the_run_ended(processes, set
     assert "2 generations" in shown[1]
 
 
-def test_watching_a_stopped_run_reports_that_it_is_not_ended(processes, settings):
-    coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
+@pytest.mark.slow
+def test_a_watch_of_a_stopped_run_ends_and_of_a_killed_one_raises_as_every_question_does(processes, small):
+    coordinator = processes.coordinator(*small)
     with Client((processes.endpoint,)) as client:
         watched = client.watch("test", 0.05)
         assert next(watched).state == "waiting for workers"
@@ -56,36 +48,24 @@ def test_watching_a_stopped_run_reports_that_it_is_not_ended(processes, settings
         *_, last = watched
     assert last.state == "left"
     assert coordinator.finish()[0] == 130
-
-
-def test_a_watcher_of_a_coordinator_that_is_killed_says_that_nobody_answers(processes, settings):
-    coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
+    coordinator = processes.resume()
+    coordinator.wait_until_serving()
     with Client((processes.endpoint,)) as client:
         watched = client.watch("test", 0.05)
         next(watched)
-        coordinator.popen.kill()
+        coordinator.end()
         with pytest.raises(ConnectionFailedError):
             for _ in watched:
                 pass
-
-
-def test_parts_that_nobody_answers_any_more_are_an_error_for_people(processes, settings):
-    coordinator = processes.coordinator(*settings, "--task", tasks.SLOW_TOY, "--generations", 1000)
-    with Client((processes.endpoint,)) as client:
-        assert client.status().run == "test"
-        coordinator.end()
         for ask in (client.workers, client.history, client.controller):
             with pytest.raises(ConnectionFailedError):
                 ask("test")
 
 
 @pytest.mark.slow
-def test_a_live_runs_controller_is_fetched_and_judged_on_another_host(processes, random_bundle, tmp_path):
+def test_a_live_runs_controller_is_fetched_and_judged_on_another_host(processes, small, tmp_path):
     """One of many units, which travels in parts; the other host has neither runs nor bundles."""
-    coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--population", 4, "--episodes", 1, "--evaluate-every", 0,
-        "--controller", "hidden", "--hidden-units", 40, "--task", tasks.TOY, "--generations", 100000,
-    )  # fmt: skip
+    coordinator = processes.coordinator(*small, "--controller", "hidden", "--hidden-units", 40, "--task", tasks.TOY)
     with Client((processes.endpoint,)) as client:
         with pytest.raises(ControllerError):
             client.controller("test")
@@ -104,15 +84,10 @@ def test_a_live_runs_controller_is_fetched_and_judged_on_another_host(processes,
         assert there.provenance["generation"] >= here.provenance["generation"]
         parts = client.candidates("test", client.status().generation.number)
         assert sum(len(part.done) for part in parts) == 4
-    code, out, err = processes.call(
-        "evaluate", "--connect", processes.endpoint, "--run", "test", "--episodes", 2, "--jobs", 1, "--json",
-        "--runs-dir", tmp_path / "nothing",
-    )  # fmt: skip
+    live = ("--connect", processes.endpoint, "--run", "test", "--runs-dir", tmp_path / "nothing")
+    code, out, err = processes.call("evaluate", *live, "--episodes", 2, "--jobs", 1, "--json")
     assert code == 0, err
     assert len(json.loads(out)["scores"]) == 2
-    code, out, err = processes.call("evaluate", "--controller", "test", "--runs-dir", processes.runs, "--episodes", 2,
-                                    "--jobs", 1, "--json")  # fmt: skip
-    assert code == 0, err
 
 
 def test_a_controller_from_here_and_one_from_a_live_run_exclude_each_other():

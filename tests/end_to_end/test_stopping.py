@@ -6,9 +6,8 @@ import signal
 import av
 import pytest
 
-from dreamfleet.worker.training.checkpoint import load_progress, load_weights
+from dreamfleet.worker.training.checkpoint import load_progress
 from dreamfleet.worker.training.data.dataset import existing_episodes
-from tests.support import tasks
 from tests.support.drives import write_drives
 
 
@@ -40,24 +39,6 @@ def test_training_keeps_all_updates(processes, tmp_path, number):
     assert all(datum in said for datum in (f" {update} ", "100000", f"{tmp_path}/vae.safetensors"))
 
 
-@pytest.mark.long
-def test_a_training_that_was_killed_goes_on_to_the_same_bits(processes, tmp_path):
-    weights = []
-    for name, killed in ("whole", False), ("killed", True):
-        folder = tmp_path / name
-        write_drives(folder, episodes=4, steps=8)
-        flags = ("--updates", 60, "--batch", 8, "--set", "channels=2,2,4,4", "validate_every=7", "keep_every=20")
-        if killed:
-            training = processes.start("train", "vae", "--data", folder, *flags)
-            while not (folder / "vae.000020.safetensors").exists():
-                assert training.popen.poll() is None, "".join(training.lines)
-            training.popen.kill()
-            assert training.finish()[0] == -signal.SIGKILL
-        assert processes.start("train", "vae", "--data", folder, *flags).finish()[0] == 0
-        weights.append(load_weights(folder / "vae.safetensors"))
-    assert all(weights[0][name].tobytes() == weights[1][name].tobytes() for name in weights[0])
-
-
 @pytest.mark.slow
 def test_a_recording_can_be_played(processes, tmp_path, number):
     out = tmp_path / "drive.mp4"
@@ -79,10 +60,3 @@ def test_a_collection_keeps_its_episodes_and_counts_them(processes, tmp_path, nu
     kept = len(existing_episodes(tmp_path))
     assert all(datum in said for datum in (str(tmp_path), f" {kept} ", "1000"))
     assert [path.name for path in (tmp_path / "episodes").iterdir() if path not in existing_episodes(tmp_path)] == []
-
-
-@pytest.mark.slow
-def test_a_coordinator_that_waits_for_a_worker_says_so_once(processes, random_bundle):
-    coordinator = processes.coordinator("--bundle", random_bundle.path, "--task", tasks.TOY)
-    coordinator.wait_for_event("no worker")
-    assert len(coordinator.events("no worker")) == 1

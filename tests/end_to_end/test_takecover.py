@@ -25,8 +25,7 @@ def evolve(processes, name, workers):
                 "--evaluation-episodes", 4)  # fmt: skip
     coordinator = processes.coordinator(*RUN, *settings, name=name)
     started = [processes.worker("--run", name, "--name", f"w{number}") for number in range(workers)]
-    code, _ = coordinator.finish()
-    assert code == 0, "".join(coordinator.lines)
+    assert coordinator.finish()[0] == 0, "".join(coordinator.lines)
     for each in started:
         each.end()
     return outcome(processes, name)

@@ -18,19 +18,16 @@ NAMES = [f"a-host-of-thirty-letters-x{number:04d}" for number in range(2)]
 class Terminal:
     """A tmux server of its own with one window."""
 
-    def __init__(self, words, env, width, height):
+    def __init__(self, words, env):
         self._socket = f"dreamfleet-{uuid.uuid4().hex}"
-        size = ("-x", str(width), "-y", str(height))
         named = [f"{name}={value}" for name, value in env.items() if name not in ("COLUMNS", "TERM", "TMUX")]
         line = shlex.join(["env", "-u", "COLUMNS", *named, *words])
-        self._call("new-session", "-d", *size, f"{line}; printf over; cat")
-
-    def lines(self):
-        return self._call("capture-pane", "-p").splitlines()
+        self._call("new-session", "-d", "-x", "80", "-y", "24", f"{line}; printf over; cat")
 
     def wait_for(self, *texts):
+        """The lines of the screen, once it has these texts."""
         deadline = time.monotonic() + DEADLINE
-        while not all(text in (seen := "\n".join(self.lines())) for text in texts):
+        while not all(text in (seen := self._call("capture-pane", "-p")) for text in texts):
             assert time.monotonic() < deadline, seen
         return seen.splitlines()
 
@@ -43,26 +40,16 @@ class Terminal:
 
 
 @pytest.fixture
-def watch(processes):
-    terminals = []
-
-    def begin(width, height):
-        words = command("status", "--connect", processes.endpoint, "--watch")
-        terminals.append(Terminal(words, environment(processes.cache), width, height))
-        return terminals[-1]
-
-    yield begin
-    for each in terminals:
-        each.end()
+def terminal(processes):
+    words = command("status", "--connect", processes.endpoint, "--watch")
+    made = Terminal(words, environment(processes.cache))
+    yield made
+    made.end()
 
 
 @pytest.mark.slow
-def test_a_watcher_sees_the_whole_run_in_24_lines_and_at_last_its_end(processes, watch, random_bundle):
-    coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--population", 4, "--episodes", 2, "--evaluate-every", 0,
-        "--task", tasks.SLOW_TOY, "--generations", 4,
-    )  # fmt: skip
-    terminal = watch(80, 24)
+def test_a_watcher_sees_the_whole_run_in_24_lines_and_at_last_its_end(processes, terminal, small):
+    coordinator = processes.coordinator(*small, "--episodes", 2, "--generations", 4)
     terminal.wait_for("waiting for workers")
     for name in NAMES:
         processes.worker("--task", tasks.SLOW_TOY, "--name", name)

@@ -1,16 +1,13 @@
 """Runs whose controllers drive otherwise: each option is replayed to the bit, and every verb knows of it."""
 
-import json
-
 import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.runs.lookup import find_controller
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support.processes import call_here
 
-POPULATION, GENERATIONS, HORIZON = 4, 2, 30
+GENERATIONS, HORIZON = 2, 30
 RUNS = {
     "pedals": (("--variant", "pedals=one", "pedal_shift=0.25"), (288, 2)),
     "halves": (("--preset", "article"), (288, 3)),
@@ -24,12 +21,10 @@ OFTEN = ("pedals", "feedback", "dreamt")
 
 
 @pytest.fixture
-def evolve(processes, random_bundle):
+def evolve(processes, small):
     def run(name, *flags):
-        coordinator = processes.coordinator(
-            "--bundle", random_bundle.path, "--population", POPULATION, "--episodes", 1, "--horizon", HORIZON,
-            "--evaluate-every", 0, "--generations", GENERATIONS, *flags, name=name,
-        )  # fmt: skip
+        driven = (*small, "--task", "car-racing", "--horizon", HORIZON, "--generations", GENERATIONS)
+        coordinator = processes.coordinator(*driven, *flags, name=name)
         worker = processes.worker("--run", name)
         assert coordinator.finish()[0] == 0, "".join(coordinator.lines)
         worker.end()
@@ -60,12 +55,8 @@ def test_every_verb_drives_as_the_run_does(processes, random_bundle, evolve):
     runs = ("--runs-dir", processes.runs)
     code, out, err = call_here("runs", "show", "one", *runs)
     assert '"decide_every": 3' in out, err
-    drives = {}
-    for jobs in (1, 2):
-        code, out, err = call_here("evaluate", "--controller", "one", *runs, "--episodes", 2, "--jobs", jobs, "--json")
-        assert code == 0, err
-        drives[jobs] = json.loads(out)["scores"]
-    assert drives[1] == drives[2]
+    code, out, err = call_here("evaluate", "--controller", "one", *runs, "--episodes", 2, "--jobs", 2)
+    assert code == 0, err
     video = processes.folder / "drive.mp4"
     code, out, err = processes.call("record", "--controller", "one", *runs, "--out", video, "--steps", 8)
     assert code == 0, err
@@ -79,34 +70,3 @@ def test_every_verb_drives_as_the_run_does(processes, random_bundle, evolve):
             steps = drive["action"][: HORIZON // 3 * 3].reshape(-1, 3, 3)
             assert (steps == steps[:, :1]).all()
             assert not (drive["action"][:, 1] * drive["action"][:, 2]).any(), "nobody brakes on the gas"
-
-
-@pytest.mark.slow
-def test_a_run_begins_from_a_controller_that_drives_alike_alone(processes, random_bundle, evolve):
-    evolve("one", "--variant", "pedals=one")
-    runs = ("--runs-dir", processes.runs)
-    two = ("coordinator", "--run", "two")
-    for flags, datum in (
-        ((*two, "--init", "one", "--variant", "decide_every=4"), '{"pedals": "one"}'),
-        ((*two, "--init", "tiny", "--bundle", "tiny", "--variant", "pedals=one"), "--variant"),
-        (("coordinator", "--from", "one", "--variant", "feedback=last"), "--variant"),
-        ((*two, "--variant", "pedal=one"), "actions, "),
-        ((*two, "--task", "gym:CartPole-v1", "--variant", "pedals=one"), "--variant"),
-    ):
-        bundle = ("--bundle", random_bundle.path) if {"--init", "one"} <= set(flags) else ()
-        code, _, err = call_here(*flags, *bundle, *runs)
-        assert code in (1, 2)
-        assert datum in err
-        assert "Traceback" not in err
-    for name, begun in (
-        ("brought", ("coordinator", "--run", "brought", "--init", "one", "--bundle", random_bundle.path)),
-        ("paying", ("coordinator", "--run", "paying", "--init", "one", "--bundle", random_bundle.path,
-                    "--variant", "pedals=one", "time_cost=0.5")),
-        ("forked", ("coordinator", "--from", "one", "--run", "forked")),
-    ):  # fmt: skip
-        settings = ("--population", 4, "--episodes", 1, "--horizon", 5, "--generations", 1, "--evaluate-every", 0)
-        coordinator = processes.start(*begun, *runs, "--listen", processes.endpoint, "--beat", 0.2, *settings)
-        processes.worker("--run", name, "--exit-when-done")
-        assert coordinator.finish()[0] == 0, "".join(coordinator.lines)
-        controller, _ = find_controller(name, processes.runs)
-        assert (controller.variant.pedals, controller.variant.time_cost) == ("one", 0.5 if name == "paying" else 0)

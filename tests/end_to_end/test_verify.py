@@ -14,9 +14,9 @@ from tests.support.same_bits import outcome
 
 
 @pytest.fixture(scope="module")
-def settings(random_bundle):
-    return ("--bundle", random_bundle.path, "--task", WATCHED, "--population", 8, "--episodes", 2,
-            "--evaluate-every", 2, "--evaluation-episodes", 4, "--generations", 5)  # fmt: skip
+def settings(small):
+    return (*small, "--task", WATCHED, "--population", 8, "--episodes", 2, "--evaluate-every", 2,
+            "--evaluation-episodes", 4, "--generations", 5)  # fmt: skip
 
 
 DYING = """
@@ -104,18 +104,13 @@ def test_a_coordinator_that_is_killed_amid_a_recall_goes_on_as_if_it_had_not_bee
 ):
     """It dies with the recall written and not committed, or committed and not continued."""
     (tmp_path / "sitecustomize.py").write_text(DYING)
-    inside = "env", f"PYTHONPATH={ROOT}:{tmp_path}", f"DIES={moment}"
-    dying = processes.start(
-        "coordinator", "--run", "test", "--runs-dir", processes.runs, "--listen", processes.endpoint, "--beat", 0.2,
-        *settings, "--verify", 1, inside=inside,
-    )  # fmt: skip
-    dying.wait_for_event("begin")
+    inside = ("env", f"PYTHONPATH={ROOT}:{tmp_path}", f"DIES={moment}")
+    dying = processes.coordinator(*settings, "--verify", 1, inside=inside)
     gathered(processes, dying, own={}, other={}, bad={LIES: 0.5})
     assert dying.popen.wait(DEADLINE) == -signal.SIGKILL
     recalled = query(processes, "SELECT count(*) FROM recalled") + query(processes, "SELECT count(*) FROM barred")
     assert (recalled == [(0,), (0,)]) == (moment == "before")
-    again = processes.resume()
-    assert again.finish()[0] == 0
+    assert processes.resume().finish()[0] == 0
     assert outcome(processes, "test") == honest
     with open_run(processes.runs, "test") as run:
         assert run.checks.barred == ("bad",)
@@ -130,12 +125,10 @@ def test_a_host_that_the_operator_bars_is_recalled_live_and_after_the_end(proces
     assert coordinator.finish()[0] == 0
     for each in first.values():
         each.end()
-    resumed = "coordinator", "--resume", "test", "--runs-dir", processes.runs
-    coordinator = processes.start(*resumed, "--generations", 5)
+    coordinator = processes.resume("test", "--generations", 5)
     coordinator.wait_for_event("begin")
     code, out, err = processes.call("bar", "bad", "--connect", processes.endpoint)
-    assert code == 0, err
-    assert "bad" in out
+    assert (code, "bad" in out) == (0, True), err
     coordinator.wait_for_event("recalled")
     worker(processes, "bad", liars["bad"]).wait_for_event("refused")
     gathered(processes, coordinator, own={}, worse=liars["worse"])
@@ -146,10 +139,8 @@ def test_a_host_that_the_operator_bars_is_recalled_live_and_after_the_end(proces
     assert code == 2
     assert all(host in err for host in ("bad", "own", "worse"))
     code, out, err = processes.call("bar", "worse", *where)
-    assert code == 0, err
-    assert "--resume test" in out
-    again = processes.start(*resumed)
-    assert again.finish()[0] == 0
+    assert (code, "--resume test" in out) == (0, True), err
+    assert processes.resume().finish()[0] == 0
     assert outcome(processes, "test") == honest
     with open_run(processes.runs, "test") as run:
         assert run.checks.barred == ("bad", "worse")

@@ -29,16 +29,16 @@ sigma0 = 0.3
 
 
 @pytest.fixture
-def first(processes, random_bundle, tmp_path):
+def first(processes, small, random_bundle, tmp_path):
     """The controller of a run of two stages that began from another controller; its journal is gone."""
     (tmp_path / "stages.toml").write_text(STAGES)
     shape = random_bundle.controller_shape
     start = np.linspace(-1, 1, shape.size, dtype=np.float32)
     Controller(shape, start, tasks.TOY, random_bundle.sha256).save(tmp_path / "start.npz")
     coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--task", tasks.TOY, "--population", 5, "--episodes", 2, "--evaluate-every", 2,
-        "--evaluation-episodes", 3, "--confirm-episodes", 4, "--steps", 400, "--schedule", tmp_path / "stages.toml",
-        "--init", tmp_path / "start.npz", name="first",
+        *small, "--task", tasks.TOY, "--population", 5, "--episodes", 2, "--evaluate-every", 2, "--evaluation-episodes",
+        3, "--confirm-episodes", 4, "--steps", 400, "--schedule", tmp_path / "stages.toml", "--init",
+        tmp_path / "start.npz", name="first",
     )  # fmt: skip
     processes.worker("--task", tasks.TOY, "--run", "first", "--exit-when-done")
     assert coordinator.finish()[0] == 0

@@ -1,6 +1,5 @@
 """Workers of other protocol versions are refused, with a remedy."""
 
-import time
 from dataclasses import replace
 
 from dreamfleet.common.client.client import Client
@@ -10,7 +9,7 @@ from dreamfleet.common.protocol.codec import decode_json, encode_json
 from dreamfleet.common.protocol.messages import HelloReply
 from dreamfleet.common.transport.session import Network, open_session
 from tests.support import tasks
-from tests.support.processes import DEADLINE
+from tests.support.processes import DEADLINE, until
 from tests.support.samples import JSON
 
 OTHERS = (1, 1), (3, 4), (2**60, 2**62)
@@ -32,13 +31,6 @@ def test_a_worker_joins_if_it_speaks_this_protocol_and_else_gets_a_remedy(proces
             assert not reply.accepted
             assert all(str(each) in reply.why for each in (*spoken, keys.PROTOCOL_VERSION))
             assert reply.remedy
-            await_that(lambda why=reply.why: client.status().refused == {"old": why}, "its status does not say so")
+            until(lambda why=reply.why: client.status().refused == {"old": why})
         assert all(hello(*spoken).accepted for spoken in OURS)
-        await_that(lambda: not client.status().refused, "the status does not list it as refused")
-
-
-def await_that(happens, why):
-    deadline = time.monotonic() + DEADLINE
-    while not happens():
-        assert time.monotonic() < deadline, why
-        time.sleep(0.05)
+        until(lambda: not client.status().refused)

@@ -20,11 +20,8 @@ def evolve(processes, bundle, name, workers, *flags):
         "--horizon", 60, "--generations", GENERATIONS, "--evaluate-every", 1, "--evaluation-episodes", 2,
         "--confirm-episodes", 2, *flags, name=name,
     )  # fmt: skip
-    crew = [
-        processes.worker("--run", name, "--name", f"w{number}", "--task", DODGE_TASK) for number in range(workers)
-    ]  # fmt: skip
-    code, _ = coordinator.finish()
-    assert code == 0, "".join(coordinator.lines + crew[0].lines)
+    crew = [processes.worker("--run", name, "--name", f"w{number}", "--task", DODGE_TASK) for number in range(workers)]
+    assert coordinator.finish()[0] == 0, "".join(coordinator.lines + crew[0].lines)
     for each in crew:
         each.end()
     return outcome(processes, name)

@@ -12,8 +12,7 @@ from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.experiments import minimise as module
 from dreamfleet.experiments.search_arguments import read_bounds, read_objective
 from tests.support import objectives
-from tests.support.access import until
-from tests.support.processes import free_port
+from tests.support.processes import free_port, until
 
 FEW = {"workers": 1, "popsize": 8}
 

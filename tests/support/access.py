@@ -1,12 +1,9 @@
 """A fleet with join files: an authority, a coordinator and workers."""
 
-import time
-
 from dreamfleet.common.addons.access.authority import Authority
 from dreamfleet.common.security.credentials import read_join_file
 from dreamfleet.common.transport.session import Network
 from tests.support import tasks
-from tests.support.processes import DEADLINE
 
 
 class Access:
@@ -44,10 +41,3 @@ def work(processes, access, endpoint, who, name="safe", *more):
         "worker", "--join", access.path(who), "--connect", endpoint, "--run", name, "--slots", 1,
         "--task", tasks.SLOW_TOY, *more,
     )  # fmt: skip
-
-
-def until(found, what):
-    deadline = time.monotonic() + DEADLINE
-    while not found():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.05)

@@ -10,7 +10,6 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
 import msgspec
-import numpy as np
 import zenoh
 
 from dreamfleet.common.protocol import keys
@@ -27,7 +26,7 @@ from dreamfleet.common.protocol.messages import (
 )
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.transport.session import open_session
-from tests.support import tasks
+from tests.support import same_bits, tasks
 from tests.support.failures import failure
 from tests.support.samples import JSON, MSGPACK
 
@@ -269,12 +268,10 @@ SECURED = [*OPEN, reports_as_the_working_worker, beats_as_the_working_worker, se
 
 
 def outcome(processes):
-    """Every fitness of every candidate, the reported controller, and the names of scoring workers."""
+    """What the run computed, and the names of scoring workers."""
     with open_run(processes.runs, RUN) as run:
-        fitness = [[run.fitness(g, i) for i in range(POPULATION)] for g in range(GENERATIONS)]
         results = [each for g in range(GENERATIONS) for i in range(POPULATION) for each in run.results(g, i)]
-        scorers = {each.worker.partition("/")[0].partition(".")[0] for each in results}
-        return fitness, np.load(run.controller_path)["parameters"].tobytes(), scorers
+        return same_bits.outcome(processes, RUN), {each.worker.partition("/")[0].partition(".")[0] for each in results}
 
 
 @contextmanager

@@ -16,12 +16,6 @@ def begin(processes, bundle, *more, task=tasks.TOY, name="test"):
     return processes.coordinator("--bundle", bundle.path, "--task", task, "--optimiser", "external", *more, name=name)
 
 
-def resume(processes, name="test"):
-    process = processes.start("coordinator", "--resume", name, "--runs-dir", processes.runs)
-    process.wait_until_serving()
-    return process
-
-
 def scorer(processes, endpoint=None, name="test"):
     return RemoteScorer(endpoint or processes.endpoint, name, patience=PATIENCE)
 

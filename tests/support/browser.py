@@ -2,8 +2,10 @@
 
 from contextlib import contextmanager
 
+from playwright.sync_api import TimeoutError as SlowPageError
 from playwright.sync_api import sync_playwright
 
+from dreamfleet.common.host.reports import ADDRESS
 from tests.support.processes import DEADLINE
 from tests.support.programs import find_program, require_programs
 
@@ -32,3 +34,28 @@ def tab(browser, **options):
     yield page
     context.close()
     assert page.said == []
+
+
+@contextmanager
+def dashboard(processes, *flags, runs=None):
+    """Its process, and the address that it printed."""
+    runs = runs or processes.runs
+    started = processes.start("dashboard", "--connect", processes.endpoint, "--runs-dir", runs, "--port", 0, *flags)
+    started.address = started.wait_for_report(ADDRESS)
+    yield started
+    started.end()
+
+
+def wait_for_text(page, text, part):
+    """Wait until the page has the text in this part."""
+    script = "([part, text]) => document.querySelector(`[data-part=${part}]`)?.textContent.includes(text)"
+    wait_until(page, script, [part, text])
+
+
+def wait_until(page, script, arg):
+    """Wait until the script says so, also without a frame."""
+    try:
+        page.wait_for_function(script, arg=arg, timeout=PATIENCE, polling=200)
+    except SlowPageError as error:
+        error.add_note(f"said: {page.said}; shown: {page.locator('body').inner_text()[:2000]}")
+        raise

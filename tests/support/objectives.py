@@ -3,7 +3,6 @@
 import functools
 import os
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -111,9 +110,3 @@ def outer():
 
 
 NUMBER = 3
-
-
-def pausing(x, seed):
-    """A noisy function that takes long enough to be killed in."""
-    time.sleep(0.02)
-    return noisy(x, seed)

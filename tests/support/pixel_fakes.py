@@ -16,20 +16,24 @@ from tests.support.pixel_world import HEIGHT, WIDTH, Dodge
 MODULE = "tests.support.pixel_fakes"
 
 
-class InDict(Dodge):
+class Observing(Dodge):
+    """Observes what `observe` makes of the picture."""
+
+    def reset(self, *, seed=None, options=None):
+        picture, info = super().reset(seed=seed, options=options)
+        return self.observe(picture), info
+
+    def step(self, action):
+        picture, *rest = super().step(action)
+        return (self.observe(picture), *rest)
+
+
+class InDict(Observing):
     """Observes a Dict of a picture and a number."""
 
     observation_space = spaces.Dict({"screen": Dodge.observation_space, "speed": spaces.Box(-1, 1, (1,), np.float32)})
 
-    def reset(self, *, seed=None, options=None):
-        picture, info = super().reset(seed=seed, options=options)
-        return self.both(picture), info
-
-    def step(self, action):
-        picture, *rest = super().step(action)
-        return (self.both(picture), *rest)
-
-    def both(self, picture):
+    def observe(self, picture):
         return {"screen": picture, "speed": np.zeros(1, np.float32)}
 
 
@@ -38,7 +42,7 @@ class InTwo(InDict):
 
     observation_space = spaces.Dict({"screen": Dodge.observation_space, "map": Dodge.observation_space})
 
-    def both(self, picture):
+    def observe(self, picture):
         return {"screen": picture, "map": picture[::-1]}
 
 
@@ -51,18 +55,10 @@ class Grey(Dodge):
         return super().render()[..., 0]
 
 
-class ChannelsFirst(Dodge):
+class ChannelsFirst(Observing):
     """Observes `(3, H, W)`, and draws floats from 0 to 1 with opacity."""
 
     observation_space = spaces.Box(0, 255, (3, HEIGHT, WIDTH), np.uint8)
-
-    def reset(self, *, seed=None, options=None):
-        picture, info = super().reset(seed=seed, options=options)
-        return self.observe(picture), info
-
-    def step(self, action):
-        picture, *rest = super().step(action)
-        return (self.observe(picture), *rest)
 
     def observe(self, picture):
         return np.moveaxis(np.rint(picture[..., :3] * 255).astype(np.uint8), -1, 0)
@@ -140,16 +136,13 @@ class BothEnds(Dodge):
         return picture, reward, dead or self.steps >= 25, self.steps >= 25, info
 
 
-class Unseen(Dodge):
+class Unseen(Observing):
     """Observes numbers, and draws pictures."""
 
     observation_space = spaces.Box(-1, 1, (2,), np.float32)
 
-    def reset(self, *, seed=None, options=None):
-        return np.zeros(2, np.float32), super().reset(seed=seed, options=options)[1]
-
-    def step(self, action):
-        return (np.zeros(2, np.float32), *super().step(action)[1:])
+    def observe(self, picture):
+        return np.zeros(2, np.float32)
 
 
 class Glass(Unseen):
@@ -164,11 +157,8 @@ class Board(Unseen):
 
     observation_space = spaces.Box(0, 9, (24, 18), np.uint8)
 
-    def reset(self, *, seed=None, options=None):
-        return np.zeros((24, 18), np.uint8), super().reset(seed=seed, options=options)[1]
-
-    def step(self, action):
-        return (np.zeros((24, 18), np.uint8), *super().step(action)[1:])
+    def observe(self, picture):
+        return np.zeros((24, 18), np.uint8)
 
 
 class Gauges(gymnasium.Env):

@@ -50,6 +50,14 @@ def environment(cache, root=ROOT):
     }
 
 
+def until(found, what="what is waited for"):
+    """Block until it is found."""
+    deadline = time.monotonic() + DEADLINE
+    while not found():
+        assert time.monotonic() < deadline, f"{what} did not come"
+        time.sleep(0.05)
+
+
 @contextmanager
 def started(words, **how):
     """A process that is killed at the end: `Popen` itself would wait for it for ever where the test fails."""
@@ -160,22 +168,18 @@ class Processes:
         self._started.append(Process(arguments, self.cache, inside, root))
         return self._started[-1]
 
-    def coordinator(self, *arguments, name="test", root=ROOT):
-        process = self.start(
-            "coordinator",
-            "--run",
-            name,
-            "--runs-dir",
-            self.runs,
-            "--listen",
-            self.endpoint,
-            "--beat",
-            "0.2",
-            *arguments,
-            root=root,
-        )
+    def coordinator(self, *arguments, name="test", at=(), inside=(), root=ROOT):
+        """Begin a run, and wait until it is served: at our port, or where the words `at` say."""
+        where = at or ("--listen", self.endpoint)
+        words = ("coordinator", "--run", name, "--runs-dir", self.runs, "--beat", 0.2, *where, *arguments)
+        process = self.start(*words, inside=inside, root=root)
         process.wait_until_serving()
         return process
+
+    def fork(self, source, *flags):
+        """Begin a run where another one is, at our port."""
+        where = ("--runs-dir", self.runs, "--listen", self.endpoint, "--beat", 0.2)
+        return self.start("coordinator", "--from", source, *where, *flags)
 
     def resume(self, name="test", *flags):
         """Continue a run here; it is served where it was before, unless the flags name another place."""

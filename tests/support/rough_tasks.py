@@ -206,13 +206,6 @@ class Parallel(Rough):
             process.join()
 
 
-class Hungry(Rough):
-    """Takes memory without an end, some slowly enough for a test to look."""
-
-    def misbehave(self):
-        self.held = [bytearray(os.urandom(1) * (16 << 20)) for _ in range(4096)]
-
-
 def leak_descriptors():
     while True:
         os.dup(0)

@@ -15,22 +15,19 @@ from dreamfleet.worker.tasks.api import Continuous, Score, Task, World
 
 MODULE = "tests.support.tasks"
 (
-    TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, EXPLODING, ENDLESS,
-    CHATTY, PAINTED, ROUNDED, SECOND_TOY, BRITTLE, FRAGILE,
+    TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, CHATTY, PAINTED, ROUNDED,
+    SECOND_TOY, BRITTLE, FRAGILE, EXPLODING,
 ) = (
     f"{MODULE}:{name}"
     for name in (
-        "Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Silent", "Judged", "Counted", "Heavy",
-        "Exploding", "Endless", "Chatty", "Painted", "Rounded", "SecondToy", "Brittle",
-        "Fragile",
+        "Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Silent", "Judged", "Counted", "Heavy", "Chatty",
+        "Painted", "Rounded", "SecondToy", "Brittle", "Fragile", "Exploding",
     )
 )  # fmt: skip
 ALL = TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, PAINTED
 STEPS_FOLDER = "DREAMFLEET_TEST_STEPS"  # where `Counted` writes
 ROUNDING = "DREAMFLEET_TEST_ROUNDING"  # if set, `Rounded` computes as on another host class
-ODD_REWARD = (
-    "DREAMFLEET_TEST_ODD_REWARD"  # a file with a number: the reward of the next episode, which removes the file
-)
+ODD_REWARD = "DREAMFLEET_TEST_ODD_REWARD"  # a file: its number is the next episode's reward, which removes the file
 
 
 class ToyEnvironment(gymnasium.Env):
@@ -138,24 +135,64 @@ class FragileEnvironment(ToyEnvironment):
         return super().reset(seed=seed, options=options)
 
 
-class Raising(Toy):
-    name = RAISING
+class Misbehaving(Toy):
+    """Its controllers call `misbehave` before each action."""
 
     def make_policy(self, assignment):
-        return RaisingPolicy()
+        return MisbehavingPolicy(self.misbehave)
 
 
-class RaisingPolicy(ToyPolicy):
+class MisbehavingPolicy(ToyPolicy):
+    def __init__(self, misbehave):
+        self._misbehave = misbehave
+
     def act(self, observation):
+        self._misbehave()
+        return super().act(observation)
+
+
+class Raising(Misbehaving):
+    name = RAISING
+
+    def misbehave(self):
         raise RuntimeError("the road has ended")
 
 
-class Crashing(Toy):
+class Crashing(Misbehaving):
     name = CRASHING
     probe_steps = 0
 
-    def make_policy(self, assignment):
-        return CrashingPolicy()
+    def misbehave(self):
+        os.kill(os.getpid(), signal.SIGSEGV)
+
+
+class Hanging(Misbehaving):
+    name = HANGING
+    probe_steps = 0
+
+    def misbehave(self):
+        time.sleep(3600)
+
+
+class Silent(Misbehaving):
+    """Closes every connection of its process, and runs on."""
+
+    name = SILENT
+    probe_steps = 0
+
+    def misbehave(self):
+        os.closerange(3, 1024)
+        time.sleep(3600)
+
+
+class Chatty(Misbehaving):
+    """Prints more than a pipe holds, on both streams."""
+
+    name = CHATTY
+
+    def misbehave(self):
+        for stream in (sys.stdout, sys.stderr):
+            print("look, " * 10_000, file=stream, flush=True)
 
 
 class SideBySide(Toy):
@@ -192,11 +229,6 @@ class ToyPolicies:
         self._actions = self._actions[rows]
 
 
-class CrashingPolicy(ToyPolicy):
-    def act(self, observation):
-        os.kill(os.getpid(), signal.SIGSEGV)
-
-
 class Nan(Toy):
     name = NAN
 
@@ -207,51 +239,6 @@ class Nan(Toy):
 class NanPolicy(ToyPolicy):
     def begin(self, parameters):
         self._action = np.full(8, np.nan)
-
-
-class Hanging(Toy):
-    name = HANGING
-    probe_steps = 0
-
-    def make_policy(self, assignment):
-        return HangingPolicy()
-
-
-class HangingPolicy(ToyPolicy):
-    def act(self, observation):
-        time.sleep(3600)
-
-
-class Silent(Toy):
-    """Closes every connection of its process, and runs on."""
-
-    name = SILENT
-    probe_steps = 0
-
-    def make_policy(self, assignment):
-        return SilentPolicy()
-
-
-class SilentPolicy(ToyPolicy):
-    def act(self, observation):
-        os.closerange(3, 1024)
-        time.sleep(3600)
-
-
-class Chatty(Toy):
-    """Prints more than a pipe holds, on both streams."""
-
-    name = CHATTY
-
-    def make_policy(self, assignment):
-        return ChattyPolicy()
-
-
-class ChattyPolicy(ToyPolicy):
-    def act(self, observation):
-        for stream in (sys.stdout, sys.stderr):
-            print("look, " * 10_000, file=stream, flush=True)
-        return super().act(observation)
 
 
 class Judged(Toy):
@@ -381,30 +368,18 @@ class OnesBatch:
 
 
 class Exploding(Toy):
-    """Rewards are finite, but their mean overflows."""
+    """A slot scores episodes together; rewards are finite, but their mean overflows."""
 
     name = EXPLODING
 
     def make_batch(self, assignment):
-        return Constant(Score(1.7e308, 10))
+        return ExplodingBatch()
 
 
-class Endless(Toy):
-    """Reports more steps than a journal can hold."""
-
-    name = ENDLESS
-
-    def make_batch(self, assignment):
-        return Constant(Score(1.0, 2**63 - 1))
-
-
-class Constant:
-    def __init__(self, score):
-        self._score = score
-
+class ExplodingBatch:
     def score(self, episodes, on_step):
-        on_step(self._score.steps)
-        return [self._score for _ in episodes]
+        on_step(10)
+        return [Score(1.7e308, 10) for _ in episodes]
 
 
 class Painted(Toy):

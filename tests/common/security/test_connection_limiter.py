@@ -13,8 +13,7 @@ from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.security.connection_limiter import MAX_UNAUTHENTICATED
 from dreamfleet.common.security.credentials import read_join_file
 from dreamfleet.common.transport.session import Network, open_session
-from tests.support.access import until
-from tests.support.processes import DEADLINE, free_port
+from tests.support.processes import DEADLINE, free_port, until
 
 
 def knock(port, count):

@@ -12,8 +12,7 @@ from dreamfleet.common.host.processes import command
 from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.worlds.gym.task import GymTask
 from tests.support import pixel_fakes
-from tests.support.access import until
-from tests.support.processes import DEADLINE, environment
+from tests.support.processes import DEADLINE, environment, until
 
 RUDE = f"{pixel_fakes.MODULE}:Rude-v0"
 
