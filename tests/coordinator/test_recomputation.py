@@ -13,6 +13,8 @@ import cma
 import numpy as np
 import pytest
 
+from tests.support.processes import printed
+
 TASK, BRITTLE = "tests.support.tasks:Toy", "tests.support.tasks:Brittle"
 SCHEDULE = """
 [[stage]]
@@ -51,33 +53,20 @@ class Recomputed:
             self.generations = journal.execute(
                 "SELECT number, seeds, sigma, mean, std, best, worst, steps FROM generation ORDER BY number"
             ).fetchall()
-            self.candidates = {
-                (generation, number): (np.frombuffer(vector, "<f4"), fitness)
-                for generation, number, vector, fitness in journal.execute(
-                    "SELECT generation, number, vector, fitness FROM candidate"
-                )
-            }
-            self.evaluated = {
-                generation: (np.frombuffer(vector, "<f4"), mean, std)
-                for generation, vector, mean, std in journal.execute(
-                    "SELECT generation, vector, mean, std FROM evaluation ORDER BY generation"
-                )
-            }
+            candidates = journal.execute("SELECT generation, number, vector, fitness FROM candidate").fetchall()
+            evaluated = journal.execute("SELECT generation, vector, mean, std FROM evaluation ORDER BY 1").fetchall()
             self.events = [text for (text,) in journal.execute("SELECT text FROM event")]
             drawn = {number: set(json.loads(seeds)) for number, seeds, *_ in self.generations}  # the last ones
-            self.results = {}
-            for kind, generation, candidate, episode, seed, fitness, steps in journal.execute(
-                "SELECT kind, generation, candidate, episode, seed, fitness, steps FROM result"
-            ):
-                if kind != "score" or seed in drawn[generation]:
-                    self.results.setdefault((kind, generation, candidate), {})[episode] = seed, fitness, steps
-            self.failed = {}
-            for kind, generation, candidate, episode, seed in journal.execute(
-                "SELECT kind, generation, candidate, episode, seed FROM failure"
-            ):
-                if kind == "score" and seed not in drawn[generation]:
-                    continue
-                self.failed.setdefault((kind, generation, candidate), set()).add(episode)
+            place = "kind, generation, candidate, episode, seed"
+            self.results, self.failed = {}, {}
+            for *key, episode, seed, fitness, steps in journal.execute(f"SELECT {place}, fitness, steps FROM result"):
+                if key[0] != "score" or seed in drawn[key[1]]:
+                    self.results.setdefault(tuple(key), {})[episode] = seed, fitness, steps
+            for *key, episode, seed in journal.execute(f"SELECT {place} FROM failure"):
+                if key[0] != "score" or seed in drawn[key[1]]:
+                    self.failed.setdefault(tuple(key), set()).add(episode)
+        self.candidates = {tuple(place): (np.frombuffer(each, "<f4"), score) for *place, each, score in candidates}
+        self.evaluated = {number: (np.frombuffer(each, "<f4"), *score) for number, each, *score in evaluated}
         self.settings = json.loads(self.facts["settings"])
 
     def stage(self, generation):
@@ -111,10 +100,8 @@ class Recomputed:
 
     def look(self, generation):
         """Mean, standard error and population deviation of one evaluation."""
-        scores = np.array(
-            [fitness for episode, (_, fitness, _) in sorted(self.results["evaluate", generation, 0].items())
-             if episode < CHOOSING]
-        )  # fmt: skip
+        rows = sorted(self.results["evaluate", generation, 0].items())
+        scores = np.array([fitness for episode, (_, fitness, _) in rows if episode < CHOOSING])
         return scores.mean(), scores.std(ddof=1) / np.sqrt(len(scores)), scores.std(), len(scores)
 
     def drive(self, generation, first, count):
@@ -198,23 +185,15 @@ def check_search(found):
         np.testing.assert_array_equal(found.evaluated[number][0], strategy.mean.astype("<f4"))
 
 
-def exported(processes, name, table):
-    folder = processes.folder / name
-    code, _, err = processes.call("runs", "export", name, "--csv", "--runs-dir", processes.runs, "--out", folder)
-    assert code == 0, err
-    with (folder / f"{table}.csv").open() as file:
-        return list(csv.DictReader(file))
-
-
 def check_scores(processes, name, found, answer):
     """Each place that shows an evaluation or the confirmed score has the same mean and error."""
     looks = {generation: found.look(generation) for generation in found.evaluated}
     for generation, (mean, _, deviation, _) in looks.items():
         assert found.evaluated[generation][1:] == pytest.approx((mean, deviation))
-    code, out, err = processes.call("runs", "show", name, "--runs-dir", processes.runs, "--json")
-    assert code == 0, err
-    shown = json.loads(out)
-    for rows in (shown["evaluations"], exported(processes, name, "evaluations")):
+    shown, folder = json.loads(printed("runs", "show", name, "--json")), processes.folder / name
+    printed("runs", "export", name, "--csv", "--out", folder)
+    exported = {path.stem: list(csv.DictReader(path.read_text().splitlines())) for path in folder.glob("*.csv")}
+    for rows in (shown["evaluations"], exported["evaluations"]):
         assert [int(each["generation"]) for each in rows] == list(looks)
         for each in rows:
             assert [float(each["mean"]), float(each["error"])] == pytest.approx(looks[int(each["generation"])][:2])
@@ -227,11 +206,10 @@ def check_scores(processes, name, found, answer):
         np.testing.assert_array_equal(file["parameters"], found.evaluated[generation][0])
     assert (report["generation"], report["confirmed"]) == (generation, True)
     assert [report["validation_mean"], report["validation_error"]] == pytest.approx([mean, error])
-    for each in (answer["confirmed"], shown["confirmed"], *exported(processes, name, "confirmation")):
+    for each in (answer["confirmed"], shown["confirmed"], *exported["confirmation"]):
         assert int(each["generation"]) == generation
         assert [float(each["mean"]), float(each["error"])] == pytest.approx([mean, error])
-    code, out, err = processes.call("runs", "show", name, "--runs-dir", processes.runs)
-    assert f"{mean:.1f} ± {error:.1f}" in out, err
+    assert f"{mean:.1f} ± {error:.1f}" in printed("runs", "show", name)
 
 
 def check_status(processes, name, found):

@@ -1,10 +1,10 @@
 """The name under which other processes find a function, or what to do if there is none."""
 
-import functools
 import os
 import subprocess
 import sys
 import types
+from functools import partial
 from operator import attrgetter
 
 import pytest
@@ -33,7 +33,7 @@ def test_a_function_of_a_module_travels_by_its_name():
         lambda x: x,
         objectives.outer(),
         objectives.Shifted().method,
-        functools.partial(objectives.noisy, seed=1),
+        partial(objectives.noisy, seed=1),
         objectives.Weighted(2),
         3,
     ],
@@ -59,11 +59,13 @@ print(name_function(cost).task, name_function(heavy).task)
 """
 
 
-def test_a_scripts_own_function_is_found_by_the_name_of_its_file(tmp_path):
-    for file, expected in (("tuning.py", "function:tuning:cost function:tuning:heavy"), ("my-tuning.py", "UsageError")):
-        (tmp_path / file).write_text(SCRIPT)
-        done = subprocess.run([sys.executable, file], cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert expected in done.stdout + done.stderr
+@pytest.mark.parametrize(
+    ("file", "expected"), [("tuning.py", "function:tuning:cost function:tuning:heavy"), ("my-tuning.py", "UsageError")]
+)
+def test_a_scripts_own_function_is_found_by_the_name_of_its_file(tmp_path, file, expected):
+    (tmp_path / file).write_text(SCRIPT)
+    done = subprocess.run([sys.executable, file], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert expected in done.stdout + done.stderr
 
 
 def test_a_function_of_a_notebooks_cell_is_to_be_put_into_a_file(monkeypatch):

@@ -5,16 +5,17 @@ import os
 import signal
 import subprocess
 import sys
-import time
 import uuid
-from pathlib import Path
+from contextlib import nullcontext
 
+import psutil
 import pytest
 
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
 from dreamfleet.coordinator.addons.runs.stored_run import open_run
 from dreamfleet.experiments.started_run import RunPausedError, _claim, _free_name, check_settings, evolve, start_run
+from tests.support.access import until
 from tests.support.processes import DEADLINE, ROOT, environment
 from tests.support.tasks import RAISING
 
@@ -25,31 +26,17 @@ MARK = "MARK_OF_A_TEST"
 @pytest.fixture
 def alive(monkeypatch):
     """A function: the processes that this test started, and those that they started."""
-    mark = f"{MARK}={uuid.uuid4().hex}"
-    monkeypatch.setenv(*mark.split("="))
+    mark = uuid.uuid4().hex
+    monkeypatch.setenv(MARK, mark)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    yield lambda: _processes_with(mark)
-    for pid in _processes_with(mark):
+
+    def alive():
+        seen = {each.pid: each.info["environ"] or {} for each in psutil.process_iter(["environ"])}
+        return [pid for pid, variables in seen.items() if variables.get(MARK) == mark and pid != os.getpid()]
+
+    yield alive
+    for pid in alive():
         os.kill(pid, signal.SIGKILL)
-
-
-def _processes_with(mark):
-    found = []
-    for path in Path("/proc").glob("[0-9]*/environ"):
-        try:
-            pid, variables = int(path.parent.name), path.read_bytes().split(b"\0")
-        except OSError:  # it has ended, or is another user's
-            continue
-        if mark.encode() in variables and pid != os.getpid():
-            found.append(pid)
-    return found
-
-
-def wait_until(reached):
-    deadline = time.monotonic() + DEADLINE
-    while not reached():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
 
 
 @pytest.mark.slow
@@ -62,7 +49,7 @@ def test_generations_come_as_they_close_and_the_journal_stays(alive, tmp_path):
         seen = [next(iter(run)).number]
         seen += [generation.number for generation in run]  # goes on where the first loop stopped
     assert seen == list(range(40))
-    wait_until(lambda: not alive())
+    until(lambda: not alive(), "its processes end")
     assert (run.state, len(run.history()), run.controller().task) == ("ended: 40 generations", 40, "gym:CartPole-v1")
     assert {each.name for each in tmp_path.joinpath("pole").glob("*.log")} == {"coordinator.log", "core-0.log"}
     run.close()
@@ -92,11 +79,8 @@ def end(_generation, run):
     ("callback", "error"), [(leave, None), (end, None), (fail, LookupError), (interrupt, KeyboardInterrupt)]
 )
 def test_a_run_that_is_left_early_ends_its_processes_and_stays_open(alive, tmp_path, callback, error):
-    if error is None:
+    with nullcontext() if error is None else pytest.raises(error):
         evolve(callback, run="pole", runs_dir=tmp_path, **SMALL)
-    else:
-        with pytest.raises(error):
-            evolve(callback, run="pole", runs_dir=tmp_path, **SMALL)
     assert not alive()
     with open_run("pole", tmp_path) as run:
         assert (run.state, len(run.history()) > 0) == ("open", True)
@@ -121,11 +105,10 @@ with dreamfleet.start_run(task="gym:CartPole-v1", evaluate_every=0, workers=2, r
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends children with a killed parent")
 def test_a_parent_that_is_killed_leaves_no_process(alive, tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-c", PARENT, tmp_path], env=environment(tmp_path), check=False, timeout=DEADLINE
-    )
+    words = [sys.executable, "-c", PARENT, tmp_path]
+    done = subprocess.run(words, env=environment(tmp_path), check=False, timeout=DEADLINE)
     assert done.returncode == -signal.SIGKILL
-    wait_until(lambda: not alive())
+    until(lambda: not alive(), "its processes end")
 
 
 @pytest.mark.slow
@@ -152,25 +135,21 @@ def test_a_pause_is_no_endless_wait(alive, tmp_path, random_bundle):
 
 @pytest.mark.slow
 def test_a_wrong_setting_starts_nothing(alive, tmp_path):
+    (tmp_path / "runs" / "pole").mkdir(parents=True)
+    (tmp_path / "runs" / "pole" / "journal.sqlite").touch()
     for settings, named in (
         ({"tsak": "gym:CartPole-v1"}, "'tsak'.* 'task'"),
         ({"population": "many"}, "--population.*'many'"),
         ({"workers": -1}, "-1"),
         ({"join": "me.join"}, "'join'"),
         ({"run": "No Name"}, "No Name"),
+        ({"run": "pole", **SMALL}, "'pole'"),
         ({"task": "gym:Nowhere-v1"}, "'Nowhere-v1'"),  # the coordinator's words
     ):
         with pytest.raises(UsageError, match=named):
             start_run(runs_dir=tmp_path / "runs", **settings)
     assert not alive()
-    assert not list(tmp_path.glob("runs/*"))
-
-
-def test_a_name_that_a_run_has_is_refused(tmp_path):
-    (tmp_path / "pole").mkdir()
-    (tmp_path / "pole" / "journal.sqlite").touch()
-    with pytest.raises(UsageError, match="'pole'"):
-        start_run(run="pole", runs_dir=tmp_path, **SMALL)
+    assert [path.name for path in tmp_path.glob("runs/*")] == ["pole"]
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 from unittest.mock import patch
 
 from dreamfleet.common.protocol.messages import HelloRequest, Intervals, JobBatch
@@ -20,9 +20,12 @@ from dreamfleet.coordinator.run.worker_protocol import WorkerProtocol
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
-from tests.simulation.disk import Disk, MemoryJournal, Witness
+from tests.simulation.disk import Disk, MemoryJournal
 from tests.simulation.schedule import Shape
 from tests.simulation.truth import Strategy, settings_of
+
+if TYPE_CHECKING:
+    from tests.simulation.witness import Witness
 
 BEAT = REPEAT = 1.0  # virtual seconds, as the run's intervals say
 TICK = 0.25  # virtual seconds between turns without a message; the product's are shorter, and cost as much

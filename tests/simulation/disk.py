@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from io import BytesIO
 from math import nan
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from dreamfleet.coordinator.storage.journal import StoredOpenGeneration
 from dreamfleet.coordinator.storage.verification_records import StoredAnswer, StoredBar
 from tests.simulation.violation import Violation
 
+if TYPE_CHECKING:
+    from tests.simulation.witness import Witness
+
 TABLES = ("fact", "generation", "result", "failure", "evaluation", "collection", "verification", "barred", "recalled")
 FOLDER = Path("/simulated/run")
 
@@ -47,29 +50,6 @@ class Disk:
         file = BytesIO()
         yield file
         self.files[path.name] = file.getvalue()
-
-
-class Witness(Protocol):
-    """Who looks at each row before it is written."""
-
-    def opened(self, number: int, vectors: tuple[bytes, ...]) -> None: ...
-    def redrawn(self, number: int, rounds: int, vectors: tuple[bytes, ...]) -> None: ...
-    def counted(self, job: Job, result: Result) -> None: ...
-    def failed(self, job: Job) -> None: ...
-    def check_fitness(self, number: int, fitness: list[float | None]) -> None: ...
-    def evaluated(self, generation: int, mean: float, std: float) -> None: ...
-
-
-@dataclass(frozen=True)
-class _Packed:
-    """A strategy's state, packed as it was or not yet."""
-
-    state: Any
-
-    @property
-    def data(self) -> bytes:
-        packed: bytes = self.state if isinstance(self.state, bytes) else self.state.packed()
-        return packed
 
 
 class MemoryTables:
@@ -108,10 +88,8 @@ class MemoryResults:
         self.tables.insert("result", result.digest, (job, result, worker, host_class))
 
     def workers(self, *, recalled: bool = False) -> list[str]:
-        rows = [
-            *self.tables.rows["result"].values(),
-            *(row for _, row in self.tables.rows["recalled"].values() if recalled),
-        ]
+        rows = list(self.tables.rows["result"].values())
+        rows += [row for _, row in self.tables.rows["recalled"].values() if recalled]
         return sorted({worker for _, _, worker, _ in rows})
 
     @property
@@ -125,15 +103,10 @@ class MemoryResults:
         return Effort()
 
     def of(self, kind: str, generation: int) -> dict[bytes, KnownResult]:
-        rows = self.tables.rows["result"].items()
-        found = {
-            digest: (result.fitness, result.steps, result.measures)
-            for digest, (job, result, *_) in rows
-            if job.kind == kind and job.generation == generation
-        }
-        failed = {digest: (nan, 0, ()) for digest, (job, _) in self.tables.rows["failure"].items()
-                  if job.kind == kind and job.generation == generation}  # fmt: skip
-        return found | failed
+        results, failures = self.tables.rows["result"].values(), self.tables.rows["failure"].values()
+        found = [(job, (each.fitness, each.steps, each.measures)) for job, each, *_ in results]
+        found += [(job, (nan, 0, ())) for job, _ in failures]
+        return {job.digest: known for job, known in found if (job.kind, job.generation) == (kind, generation)}
 
     def fitness_of(self, kind: Kind, digests: Sequence[bytes]) -> dict[bytes, float]:
         rows = self.tables.rows["result"]
@@ -250,22 +223,18 @@ class MemoryRecalls:
             elif because == "surplus" and row[0].generation > number:
                 self.tables.put("recalled", (digest, worker), ("rewound", row))
         for digest, row in list(self.tables.rows["result"].items()):
-            job = row[0]
-            if job.generation > number or (job.generation == number and job.kind != "score"):
+            if _is_behind(row[0], number):
                 self._set_aside("rewound", digest, row)
         for digest, (job, _) in list(self.tables.rows["failure"].items()):
-            if job.generation > number or (job.generation == number and job.kind != "score"):
+            if _is_behind(job, number):
                 self.tables.put("failure", digest, None)
         for table in ("evaluation", "collection"):
             for each in [each for each in self.tables.rows[table] if each >= number]:
                 self.tables.put(table, each, None)
         for each in [each for each in self.tables.rows["generation"] if each > number]:
             self.tables.put("generation", each, None)
-        row = self.tables.rows["generation"][number]
-        first = {"vectors": row["first"], "first": row["first"], "redrawn": ()}
-        self.tables.put(
-            "generation", number, {"state": row["state"], **first, "seeds": tuple(seeds), "restored": _Packed(state)}
-        )
+        first = self.tables.rows["generation"][number]["first"]
+        self.tables.put("generation", number, {"state": state, "seeds": tuple(seeds), **_asked(first)})
         self._settle_recall()
 
     @property
@@ -295,11 +264,13 @@ class MemoryJournal:
         self.verification = MemoryVerification(self.tables)
         self.recalls = MemoryRecalls(self.tables)
 
+    def _ignored(self, *_: object, **__: object) -> None:
+        """No rule hangs on it, and nobody else locks or reads the simulated folder."""
+
+    close = set_patience = take_lock = set_seconds = add_event = end_incarnation = _ignored
+
     def commit(self) -> None:
         self.tables.commit()
-
-    def close(self) -> None:
-        """Nothing is held."""
 
     def fact(self, key: str) -> str | None:
         found: str | None = self.tables.rows["fact"].get(key)
@@ -326,31 +297,15 @@ class MemoryJournal:
         """No rule hangs on the time of a generation, which is written with them."""
         return False
 
-    def set_patience(self, seconds: float) -> None:
-        """Nobody else locks it."""
-
-    def take_lock(self) -> None:
-        """Nobody else locks it."""
-
-    def set_seconds(self, generation: int, seconds: float) -> None:
-        """No rule hangs on it."""
-
-    def add_event(self, text: str, what: str = "", worker: str = "") -> None:
-        """No rule hangs on it."""
-
     def begin_incarnation(self) -> int:
         number = int(self.fact("incarnation") or 0) + 1
         self.set_fact("incarnation", str(number))
         self.commit()
         return number
 
-    def end_incarnation(self) -> None:
-        """No rule hangs on it."""
-
     def open_generation(self, number: int, state: Any, sigma: float, seeds: Sequence[int], vectors: Any) -> None:
         self.tables.witness.opened(number, tuple(vectors))
-        first = {"vectors": tuple(vectors), "first": tuple(vectors), "redrawn": ()}
-        self.tables.insert("generation", number, {"state": state, "seeds": tuple(seeds), **first})
+        self.tables.insert("generation", number, {"state": state, "seeds": tuple(seeds), **_asked(tuple(vectors))})
 
     def close_generation(self, closed: StoredGeneration, fitness: Any, measures: Any = None) -> None:
         row = self.tables.rows["generation"][closed.number]
@@ -388,9 +343,8 @@ class MemoryJournal:
         self.tables.insert("failure", job.digest, (job, tuple(workers)))
 
     def drop_failures(self, generation: int) -> None:
-        of_it = [digest for digest, (job, _) in self.tables.rows["failure"].items()
-                 if job.kind == "score" and job.generation == generation]  # fmt: skip
-        self.drop_failures_of(of_it)
+        jobs = [job for job, _ in self.tables.rows["failure"].values()]
+        self.drop_failures_of([job.digest for job in jobs if (job.kind, job.generation) == ("score", generation)])
 
     def drop_failures_of(self, digests: Sequence[bytes]) -> None:
         for digest in digests:
@@ -420,7 +374,7 @@ class MemoryJournal:
         row = self.tables.rows["generation"].get(number)
         if row is None or number < max(self.tables.rows["generation"]) - 1:
             return None
-        state = row["restored"].data if "restored" in row else row["state"].packed()
+        state = row["state"] if isinstance(row["state"], bytes) else row["state"].packed()
         return StoredOpenGeneration(number, state, row["seeds"], row["vectors"], row["redrawn"])
 
     def read_closed(self) -> tuple[list[StoredGeneration], list[StoredEvaluation]]:
@@ -444,6 +398,16 @@ class MemoryJournal:
     def evaluated_vector(self, generation: int) -> bytes:
         vector: bytes = self.tables.rows["evaluation"][generation][0].vector
         return vector
+
+
+def _asked(vectors: tuple[bytes, ...]) -> dict[str, Any]:
+    """Columns of a population none of which was drawn anew."""
+    return {"vectors": vectors, "first": vectors, "redrawn": ()}
+
+
+def _is_behind(job: Job, number: int) -> bool:
+    """Whether a job follows from the fitness of this generation."""
+    return job.generation > number or (job.generation == number and job.kind != "score")
 
 
 def _apply(rows: dict[Any, Any], key: Any, row: Any) -> None:

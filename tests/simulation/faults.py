@@ -8,50 +8,69 @@ from collections.abc import Callable
 from dreamfleet.common.protocol.messages import Result, ResultBatch
 from dreamfleet.coordinator.run.run import BY_HAND
 from dreamfleet.coordinator.service.control import DRAINING
-from tests.simulation.network import Effect, Way
+from tests.simulation.coordinator import Coordinator
+from tests.simulation.network import Effect
 from tests.simulation.schedule import Fault
 from tests.simulation.truth import STEPS
 from tests.simulation.worker import UID, Worker
 from tests.simulation.world import Pending, World
 
 LEASE = 4.0  # seconds of silence after which each side of a connection gives the other up
+Strike = Callable[[World, Fault], bool | None]  # `False`: it found nothing to disturb
+STRIKES: dict[str, Strike] = {}
 
 
 def strike(world: World, fault: Fault) -> None:
     """Let it happen; one that finds nothing to disturb is not counted."""
-    fault_of = _STRIKES.get(fault.kind)
-    if fault_of is None:
-        kind, _, way = fault.kind.partition("_")
-        assert way in ("up", "down"), f"no fault is called {fault.kind}"
-        struck = _message(world, fault, kind, "up" if way == "up" else "down")
-    else:
-        struck = fault_of(world, fault)
-    world.happened[fault.kind] += struck
+    kind, _, way = fault.kind.partition("_")
+    if way in ("up", "down"):
+        effect = Effect(kind, world.now + fault.seconds, fault.amount)
+        world.links[_host(world, fault)].disturb("up" if way == "up" else "down", effect)
+    elif STRIKES[fault.kind](world, fault) is False:
+        return
+    world.happened[fault.kind] += 1
 
 
-def _message(world: World, fault: Fault, kind: str, way: Way) -> bool:
-    """For `seconds`, messages are lost, doubled (the second `amount` later), late, or out of order by `amount`."""
-    world.links[_host(world, fault)].disturb(way, Effect(kind, world.now + fault.seconds, fault.amount))
-    return True
+def _kind(struck: Strike) -> Strike:
+    """Register what the kind of fault of this name does."""
+    STRIKES[struck.__name__] = struck
+    return struck
 
 
-def _cut(world: World, fault: Fault) -> bool:
-    """The connection ends; the coordinator notices within `amount` seconds, the worker in half of that."""
-    host, worker = _host(world, fault), _worker(world, fault)
-    world.links[host].cuts += 1
-    world.later(fault.amount / 2, world.lose_sight, host)
-    if worker is not None:
-        world.later(fault.amount, world.send_to_coordinator, worker.identity, "gone")
-    world.later(fault.seconds, _mend, world, host)
-    return True
+def _of_worker(struck: Callable[[World, Fault, Worker], bool | None]) -> None:
+    """Register what a kind of fault does to a worker that is there."""
+
+    def of_worker(world: World, fault: Fault) -> bool | None:
+        worker = _worker(world, fault)
+        return False if worker is None else struck(world, fault, worker)
+
+    STRIKES[struck.__name__] = of_worker
 
 
-def _cut_unnoticed(world: World, fault: Fault) -> bool:
-    """Like a cut, but shorter than any lease: neither side notices."""
+def _of_coordinator(struck: Callable[[World, Fault, Coordinator], bool | None]) -> None:
+    """Register what a kind of fault does to a coordinator that is there."""
+
+    def of_coordinator(world: World, fault: Fault) -> bool | None:
+        return False if world.coordinator is None else struck(world, fault, world.coordinator)
+
+    STRIKES[struck.__name__] = of_coordinator
+
+
+@_kind
+def cut_unnoticed(world: World, fault: Fault) -> None:
+    """The connection ends, for less than any lease: neither side notices."""
     host = _host(world, fault)
     world.links[host].cuts += 1
     world.later(fault.seconds, _mend, world, host)
-    return True
+
+
+@_kind
+def cut(world: World, fault: Fault) -> None:
+    """The connection ends; the coordinator notices within `amount` seconds, the worker in half of that."""
+    world.later(fault.amount / 2, world.lose_sight, _host(world, fault))
+    if (worker := _worker(world, fault)) is not None:
+        world.later(fault.amount, world.send_to_coordinator, worker.identity, "gone")
+    cut_unnoticed(world, fault)
 
 
 def _mend(world: World, host: int) -> None:
@@ -59,45 +78,37 @@ def _mend(world: World, host: int) -> None:
     world.later(0.02, world.look, host)
 
 
-def _lose_token(world: World, fault: Fault) -> bool:
+@_of_worker
+def lose_token(world: World, fault: Fault, worker: Worker) -> None:
     """One side alone sees the other vanish: the coordinator, or with a larger `amount` the worker, for a moment."""
-    worker = _worker(world, fault)
-    if worker is None:
-        return False
     if fault.amount < 0.6:
         world.send_to_coordinator(worker.identity, "gone")
     else:
         world.look(_host(world, fault), blink=True)
-    return True
 
 
-def _late_token(world: World, fault: Fault) -> bool:
+@_of_worker
+def late_token(world: World, fault: Fault, worker: Worker) -> None:
     """A departure that is reported `amount` seconds late, perhaps after the worker is back."""
-    worker = _worker(world, fault)
-    if worker is None:
-        return False
     world.later(fault.amount, world.send_to_coordinator, worker.identity, "gone")
-    return True
 
 
-def _kill_worker(world: World, fault: Fault) -> bool:
+@_of_worker
+def kill_worker(world: World, fault: Fault, _killed: Worker) -> None:
     """A process ends; its token vanishes `amount` later, before or after its last results have arrived."""
-    if _worker(world, fault) is None:
-        return False
     world.end_worker(_host(world, fault), fault.amount, fault.seconds)
-    return True
 
 
-def _stop_worker(world: World, fault: Fault) -> bool:
+@_of_worker
+def stop_worker(world: World, fault: Fault, worker: Worker) -> bool | None:
     """A process is suspended and goes on; if that takes longer than a lease, both sides notice."""
-    worker, host = _worker(world, fault), _host(world, fault)
-    if worker is None or worker.stopped:
+    if worker.stopped:
         return False
     worker.stopped = True
     if fault.seconds > LEASE:
         world.later(LEASE, world.send_to_coordinator, worker.identity, "gone")
-    world.later(fault.seconds, _go_on, world, host, worker, fault.seconds > LEASE)
-    return True
+    world.later(fault.seconds, _go_on, world, _host(world, fault), worker, fault.seconds > LEASE)
+    return None
 
 
 def _go_on(world: World, host: int, worker: Worker, parted: bool) -> None:
@@ -111,57 +122,48 @@ def _go_on(world: World, host: int, worker: Worker, parted: bool) -> None:
     world.wake_worker(host, worker, world.now)
 
 
-def _slow_worker(world: World, fault: Fault) -> bool:
+@_of_worker
+def slow_worker(world: World, fault: Fault, worker: Worker) -> None:
     """Turns that begin now take longer, up to ten times."""
-    worker = _worker(world, fault)
-    if worker is None:
-        return False
     worker.slowness = 1.0 + fault.amount
-    world.later(fault.seconds, _recover, worker)
-    return True
+    world.later(fault.seconds, setattr, worker, "slowness", 1.0)
 
 
-def _recover(worker: Worker) -> None:
-    worker.slowness = 1.0
-
-
-def _drain_worker(world: World, fault: Fault) -> bool:
+@_of_worker
+def drain_worker(_world: World, _fault: Fault, worker: Worker) -> None:
     """Somebody presses Ctrl-C once."""
-    worker = _worker(world, fault)
-    if worker is None:
-        return False
     worker.membership.stop()
-    return True
 
 
-def _fail(world: World, fault: Fault) -> bool:
+@_of_worker
+def fail(_world: World, fault: Fault, worker: Worker) -> None:
     """The next turns give an error instead of a fitness."""
-    worker = _worker(world, fault)
-    if worker is None:
-        return False
     worker.failures += math.ceil(fault.amount)
-    return True
 
 
-def _kill_coordinator(world: World, fault: Fault) -> bool:
+@_of_coordinator
+def kill_coordinator(world: World, fault: Fault, _life: Coordinator) -> None:
     """It ends after `amount` more steps of its turns: between any event, write, commit and message."""
-    if world.coordinator is None:
-        return False
-    world.kill = Pending(int(fault.amount), fault.seconds, opening=fault.kind == "kill_at_opening")
-    return True
+    world.kill = Pending(int(fault.amount), fault.seconds, opening=False)
 
 
-def _stop_coordinator(world: World, fault: Fault) -> bool:
+@_of_coordinator
+def kill_at_opening(world: World, fault: Fault, _life: Coordinator) -> None:
+    """It ends `amount` steps after it has opened the next generation."""
+    world.kill = Pending(int(fault.amount), fault.seconds, opening=True)
+
+
+@_of_coordinator
+def stop_coordinator(world: World, fault: Fault, life: Coordinator) -> bool | None:
     """It stands still, as on a suspended host: what arrives waits, and the clock makes a jump."""
-    life = world.coordinator
-    if life is None or world.coordinator_stopped:
+    if world.coordinator_stopped:
         return False
     world.coordinator_stopped = True
     world.later(fault.seconds, _continue_coordinator, world, life, fault.seconds > LEASE)
-    return True
+    return None
 
 
-def _continue_coordinator(world: World, life: object, parted: bool) -> None:
+def _continue_coordinator(world: World, life: Coordinator, parted: bool) -> None:
     if world.coordinator is not life:
         return
     world.coordinator_stopped = False
@@ -173,63 +175,57 @@ def _continue_coordinator(world: World, life: object, parted: bool) -> None:
     world.wake_coordinator(0.0)
 
 
-def _leave(world: World, _fault: Fault) -> bool:
+@_of_coordinator
+def leave(_world: World, _fault: Fault, life: Coordinator) -> None:
     """Somebody says `dreamfleet drain`: what runs is finished, then the coordinator leaves."""
-    life = world.coordinator
-    if life is None:
-        return False
     life.draining = True
     life.run.pause(DRAINING)
-    return True
 
 
-def _pause(world: World, fault: Fault) -> bool:
+@_of_coordinator
+def pause(world: World, fault: Fault, life: Coordinator) -> None:
     """Somebody says `dreamfleet pause`, and after a while `dreamfleet resume`."""
-    life = world.coordinator
-    if life is None:
-        return False
     life.run.pause(BY_HAND)
     world.later(fault.seconds, world.resume, life)
-    return True
 
 
-def _bar(world: World, fault: Fault) -> bool:
+@_of_coordinator
+def bar(world: World, fault: Fault, life: Coordinator) -> bool | None:
     """Somebody bars an honest host, so what it brought is recalled, and lets it in again."""
-    life, host = world.coordinator, _host(world, fault)
-    if life is None or world.coordinator_stopped or world.is_silent or life.run.bar(f"w{host}"):
+    host = _host(world, fault)
+    if world.coordinator_stopped or world.is_silent or life.run.bar(f"w{host}"):
         return False
     world.wake_coordinator(0.0)
-    world.later(fault.seconds, world.unbar, host)
-    return True
+    world.later(fault.seconds, world.bar, host, False)
+    return None
 
 
-def _resume(world: World, _fault: Fault) -> bool:
+@_of_coordinator
+def resume(_world: World, _fault: Fault, life: Coordinator) -> bool | None:
     """Somebody says `dreamfleet resume` of a run that is not paused: what failed is tried again."""
-    life = world.coordinator
-    if life is None or life.draining or life.run.state.paused is not None:
+    if life.draining or life.run.state.paused is not None:
         return False
     life.run.resume()
-    return True
+    return None
 
 
-def _stranger(world: World, fault: Fault) -> bool:
+@_kind
+def stranger(world: World, fault: Fault) -> None:
     """A result that nobody asked for: of no job, or another fitness of one that counts already."""
     known = list(world.disk.tables["result"])
     unknown = bytes([int(fault.at * 100) % 256]) * 32
     digest = known[int(fault.at * 1000) % len(known)] if known and fault.amount > 1.0 else unknown
     worker = _worker(world, fault)
     # Where results are checked, a forger can have a worker barred in whose name it speaks: it is a stranger there.
-    in_its_name = worker is not None and not world.shape.verify
-    identity = worker.identity if worker is not None and in_its_name else "stranger/0badc0de"
+    identity = "stranger/0badc0de" if worker is None or world.shape.verify else worker.identity
     result = Result(digest, 99.0, STEPS, 0.1, None, None)
     world.send_to_coordinator(identity, ResultBatch(run_uid=UID, incarnation=1, fingerprint="f", results=(result,)))
-    return True
 
 
-def _garble(world: World, fault: Fault) -> bool:
+@_kind
+def garble(world: World, fault: Fault) -> None:
     """The next batch names another seed than the one that the digest is of."""
     world.links[_host(world, fault)].garbled = True
-    return True
 
 
 def _host(world: World, fault: Fault) -> int:
@@ -238,25 +234,3 @@ def _host(world: World, fault: Fault) -> int:
 
 def _worker(world: World, fault: Fault) -> Worker | None:
     return world.workers[_host(world, fault)]
-
-
-_STRIKES: dict[str, Callable[[World, Fault], bool]] = {
-    "cut": _cut,
-    "cut_unnoticed": _cut_unnoticed,
-    "lose_token": _lose_token,
-    "late_token": _late_token,
-    "kill_worker": _kill_worker,
-    "stop_worker": _stop_worker,
-    "slow_worker": _slow_worker,
-    "drain_worker": _drain_worker,
-    "fail": _fail,
-    "kill_coordinator": _kill_coordinator,
-    "kill_at_opening": _kill_coordinator,
-    "stop_coordinator": _stop_coordinator,
-    "leave": _leave,
-    "pause": _pause,
-    "bar": _bar,
-    "resume": _resume,
-    "stranger": _stranger,
-    "garble": _garble,
-}

@@ -31,17 +31,10 @@ Lie = Callable[[Job, float], float]
 class LenientWitness(Witness):
     """Believes what is written while liars are about, and compares everything with the truth at the end."""
 
-    def opened(self, number: int, vectors: tuple[bytes, ...]) -> None:
-        """It may follow from a lie."""
+    def _ignored(self, *_: object) -> None:
+        """It may be a lie, or follow from one."""
 
-    def counted(self, job: Job, result: Any) -> None:
-        """It may be a lie."""
-
-    def check_fitness(self, number: int, fitness: list[float]) -> None:
-        """It may follow from a lie."""
-
-    def evaluated(self, generation: int, mean: float, std: float) -> None:
-        """It may follow from a lie."""
+    opened = counted = check_fitness = evaluated = _ignored
 
     def finished(self, disk: Disk) -> None:
         """What counts is true, whoever lied."""
@@ -137,17 +130,8 @@ def play_with(
 
 def shape_of(workers: int, share: float, seed: int) -> Shape:
     """A run of eight generations, of 20 candidates in two episodes each, with two evaluations; half of them race."""
-    return Shape(
-        workers=workers,
-        generations=8,
-        population=20,
-        episodes=2,
-        racing=seed % 2 == 1,
-        evaluate_every=4,
-        turn=0.5,
-        run_seed=seed,
-        verify=share,
-    )
+    search = {"generations": 8, "population": 20, "episodes": 2, "racing": seed % 2 == 1, "evaluate_every": 4}
+    return Shape(workers, turn=0.5, run_seed=seed, verify=share, **search)
 
 
 def campaign(plays: int, share: float, workers: tuple[int, ...]) -> Iterator[dict[str, Any]]:

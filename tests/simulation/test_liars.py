@@ -18,94 +18,81 @@ from tests.simulation.world import play
 
 SHAPE = replace(shape_of(3, 1.0, 1), racing=False, generations=3, population=4, evaluate_every=1)
 RACE = {"racing": True, "episodes": 3}
+OWN = frozenset({0})  # the coordinator's own host
+HALF = {1: by_chance(0.5, 1)}
 
 
 def fleet(workers, share=1.0, faults=(), **more):
     return Schedule(replace(SHAPE, workers=workers, verify=share, **more), faults)
 
 
+def away(worker, seconds):
+    """A worker that comes late."""
+    return (Fault(0.02, "kill_worker", worker, seconds, 0.0),)
+
+
+def assert_barred(schedule, lies=HALF, anchors=frozenset(), bars=None):
+    """Whoever lies is barred, nobody else, and what counts is true."""
+    found = play_with(schedule, lies, anchors, bars=bars)
+    assert found.barred == {f"w{host}" for host in lies}
+    assert found.is_honest
+
+
 @pytest.mark.parametrize("lie", [(by_chance, 0.5, 1), (for_a_candidate, 0.25, 4, 1), (one_flip, 3)])
 @pytest.mark.parametrize("workers", [2, 3, 4])
 def test_who_differs_is_barred_and_what_counts_is_true(lie, workers):
     make, *given = lie
-    found = play_with(fleet(workers), {1: make(*given)}, frozenset({0}))
-    assert found.barred == {"w1"}
-    assert found.is_honest
+    assert_barred(fleet(workers), {1: make(*given)}, OWN)
 
 
-@pytest.mark.parametrize("lie", [(by_chance, 0.5, 1), (for_a_candidate, 0.25, 4, 1)])
+@pytest.mark.parametrize("lie", [by_chance(0.5, 1), for_a_candidate(0.25, 4, 1)])
 @pytest.mark.parametrize("seed", range(4))
 def test_a_race_that_lies_decided_is_decided_again(lie, seed):
-    make, *given = lie
-    found = play_with(fleet(3, 0.5, run_seed=seed, **RACE), {1: make(*given)}, frozenset({0}))
-    assert found.barred == {"w1"}
-    assert found.is_honest
+    assert_barred(fleet(3, 0.5, run_seed=seed, **RACE), {1: lie}, OWN)
 
 
 def test_a_liar_that_came_late_takes_the_run_back_to_where_it_came():
-    late = Fault(0.02, "kill_worker", 1, 6.0, 0.0)
-    found = play_with(fleet(3, 0.3, generations=6, faults=(late,)), {1: by_chance(0.5, 1)})
-    assert found.barred == {"w1"}
-    assert found.is_honest
+    assert_barred(fleet(3, 0.3, generations=6, faults=away(1, 6.0)))
 
 
 def test_without_an_anchor_a_third_host_decides():
-    found = play_with(fleet(3), {1: by_chance(0.5, 1)})
-    assert found.barred == {"w1"}
-    assert found.is_honest
+    assert_barred(fleet(3))
 
 
 def test_two_hosts_that_stay_with_their_words_are_held_until_a_third_decides():
-    late = Fault(0.02, "kill_worker", 2, 40.0, 0.0)
-    found = play_with(fleet(3, faults=(late,)), {1: by_chance(0.5, 1)})
-    assert found.barred == {"w1"}
-    assert found.is_honest
+    assert_barred(fleet(3, faults=away(2, 40.0)))
 
 
 def test_memory_that_fails_once_is_found_between_two_hosts_without_an_anchor():
-    found = play_with(fleet(2), {1: one_flip(3)})
-    assert found.barred == {"w1"}
-    assert found.is_honest
+    assert_barred(fleet(2), {1: one_flip(3)})
 
 
 def test_bad_memory_on_the_coordinators_own_host_is_found_by_two_others():
-    found = play_with(fleet(3), {0: by_chance(0.5, 0)}, frozenset({0}))
-    assert found.barred == {"w0"}
-    assert found.is_honest
+    assert_barred(fleet(3), {0: by_chance(0.5, 0)}, OWN)
 
 
 @pytest.mark.parametrize("race", [{}, RACE])
 @pytest.mark.parametrize("at", [0.5, 2.0, 3.5])
 def test_a_host_that_the_operator_bars_is_recalled_though_nothing_is_checked(at, race):
     kills = tuple(Fault(moment, "kill_coordinator", 0, 0.3, 7) for moment in (at, at + 0.6))
-    found = play_with(fleet(3, 0.0, faults=kills, generations=6, **race), {1: by_chance(0.5, 1)}, bars={1: at})
-    assert found.barred == {"w1"}
-    assert found.is_honest
+    assert_barred(fleet(3, 0.0, faults=kills, generations=6, **race), bars={1: at})
 
 
 def test_a_stage_that_ends_at_a_score_is_decided_again():
-    staged = {"first_stage": 2, "first_score": 1.4, "anew": True}
-    found = play_with(fleet(3, **staged), {1: by_chance(0.5, 1)})
-    assert found.barred == {"w1"}
-    assert found.is_honest
+    assert_barred(fleet(3, first_stage=2, first_score=1.4, anew=True))
 
 
 @pytest.mark.parametrize("step", range(0, 60, 3))
 def test_a_coordinator_that_is_killed_about_a_recall_recalls_all(step):
-    kills = tuple(Fault(at, "kill_coordinator", 0, 0.3, step) for at in (1.0, 1.6, 2.2, 2.8, 3.4))
-    found = play_with(fleet(3, faults=kills), {1: by_chance(0.5, 1)})
-    assert found.barred == {"w1"}
-    assert found.is_honest
+    assert_barred(
+        fleet(3, faults=tuple(Fault(at, "kill_coordinator", 0, 0.3, step) for at in (1.0, 1.6, 2.2, 2.8, 3.4)))
+    )
 
 
 def test_an_honest_fleet_loses_no_more_than_the_share_and_accuses_nobody():
-    scored = counted = checked = 0
-    for seed in range(3):
-        shape = shape_of(5, 0.1, seed)
-        found = play_with(Schedule(shape, ()), {})
-        assert found.is_honest
-        assert not found.barred
-        scored, counted, checked = scored + found.scored, counted + found.counted, checked + found.checked
+    plays = [play_with(Schedule(shape_of(5, 0.1, seed), ()), {}) for seed in range(3)]
+    assert all(found.is_honest and not found.barred for found in plays)
+    scored, counted, checked = (sum(getattr(each, name) for each in plays) for name in ("scored", "counted", "checked"))
     assert 0.05 * counted < checked < 0.15 * counted
     assert scored - counted - checked <= 0.02 * counted + 3 * 5, "beside the copies that measure newcomers"
 
@@ -128,25 +115,21 @@ def test_most_liars_are_barred_and_nobody_else():
 )
 def test_a_recall_that_forgets_a_part_is_noticed(target, name, forgetful):
     """Each forgets one thing: where the run is another, its results, the strategy's state."""
-    is_noticed = False
+
+    def is_noticed(seed):
+        schedule = fleet(3, 0.3, run_seed=seed, generations=6, faults=away(1, 6.0))  # its first results are late
+        try:
+            return not play_with(schedule, {1: by_chance(0.3, seed)}).is_honest
+        except (Violation, JournalError):
+            return True
+
     with patch.object(target, name, forgetful):
-        for seed in range(4):
-            try:
-                late = Fault(0.02, "kill_worker", 1, 6.0, 0.0)  # its first results are in a later generation
-                shape = {"run_seed": seed, "generations": 6, "faults": (late,)}
-                found = play_with(fleet(3, 0.3, **shape), {1: by_chance(0.3, seed)})
-                is_noticed = is_noticed or not found.is_honest
-            except (Violation, JournalError):
-                is_noticed = True
-    assert is_noticed
+        assert any(map(is_noticed, range(4)))
 
 
 @pytest.mark.parametrize(
     ("name", "forgetful"),
-    [
-        ("surplus", []),
-        ("fitness", MUTANTS["generation_counts_what_its_race_does_not_want"].replacement),
-    ],
+    [("surplus", []), ("fitness", MUTANTS["generation_counts_what_its_race_does_not_want"].replacement)],
 )
 def test_a_recall_that_forgets_what_a_race_wants_is_noticed(name, forgetful):
     with patch.object(Generation, name, forgetful):

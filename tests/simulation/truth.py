@@ -23,7 +23,11 @@ from tests.simulation.schedule import Shape
 STEPS = 100  # of every episode
 TASK = "simulated"
 SECOND_HORIZON, SECOND_PATIENCE, SECOND_SIGMA = 2 * STEPS, 7, 0.25  # of a second stage
-
+# Settings that a shape calls as a run does.
+EQUAL = (
+    "population", "episodes", "evaluate_every", "evaluation_episodes", "racing", "confirm_episodes", "collect_every",
+    "on_failure",
+)  # fmt: skip
 MAX_RETRIES = 3  # times that a generation gets other seeds, and that its failed candidates are drawn anew
 
 
@@ -75,23 +79,10 @@ class Strategy:
 @lru_cache(4096)
 def settings_of(shape: Shape) -> RunSettings:
     """The frozen settings of the run."""
-    return RunSettings(
-        task=TaskSpec(TASK, "", STEPS, 0),
-        controller=ControllerShape(shape.parameters // 2 - 1, 2),
-        population=shape.population,
-        episodes=shape.episodes,
-        sigma0=0.5,
-        covariance="diagonal",
-        seed=shape.run_seed,
-        evaluate_every=shape.evaluate_every,
-        evaluation_episodes=shape.evaluation_episodes,
-        racing=shape.racing,
-        confirm_episodes=shape.confirm_episodes,
-        collect_every=shape.collect_every,
-        optimiser=TASK,
-        stages=_stages_of(shape),
-        on_failure=shape.on_failure,
-    )
+    equal = {name: getattr(shape, name) for name in EQUAL}
+    controller = ControllerShape(shape.parameters // 2 - 1, 2)
+    fixed = {"task": TaskSpec(TASK, "", STEPS, 0), "sigma0": 0.5, "covariance": "diagonal", "optimiser": TASK}
+    return RunSettings(controller=controller, seed=shape.run_seed, stages=_stages_of(shape), **fixed, **equal)
 
 
 def _stages_of(shape: Shape) -> tuple[StageSettings, ...]:

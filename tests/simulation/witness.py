@@ -43,17 +43,15 @@ class Witness:
     def check_fitness(self, number: int, fitness: list[float | None]) -> None:
         """The strategy got this fitness: compare it with the truth."""
         if fitness != self.truth.fitness[number]:
-            raise Violation(
-                "fitness", f"generation {number} got fitness {fitness}, without faults {self.truth.fitness[number]}"
-            )
+            expected = self.truth.fitness[number]
+            raise Violation("fitness", f"generation {number} got fitness {fitness}, without faults {expected}")
 
     def evaluated(self, generation: int, mean: float, std: float) -> None:
         """An evaluation was finished."""
         expected = self.truth.evaluations[generation]
         if (mean, std) != (expected.mean, expected.std):
-            raise Violation(
-                "fitness", f"the mean of generation {generation} is evaluated to {mean}, not {expected.mean}"
-            )
+            what = f"the mean of generation {generation}"
+            raise Violation("fitness", f"{what} is evaluated to {mean}, not {expected.mean}")
 
     def promised(self, disk: Disk, batch: JobBatch) -> None:
         """A batch leaves: what it says is counted must be on the disk, or a crash would take it back."""

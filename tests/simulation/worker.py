@@ -198,9 +198,8 @@ class Worker:
             self.backlog.clear()
         self._fill(now)
         self._say(now)
-        hands = WorkerLoad(
-            idle=not any(self.turns), awaits_verdict=len(self.outbox) > 0, uploading=len(self.uploads) > 0
-        )
+        idle, awaits_verdict = not any(self.turns), len(self.outbox) > 0
+        hands = WorkerLoad(idle=idle, awaits_verdict=awaits_verdict, uploading=len(self.uploads) > 0)
         if self.membership.must_rejoin(now, hands):
             self.membership.note_hello_sent(now, RETRY * self._jitter)
             self._ask(now)
@@ -210,18 +209,10 @@ class Worker:
         self._question += 1
         self.asked_at = now
         self._waits_until = now + HELLO_TIMEOUT
-        request = HelloRequest(
-            PROTOCOL_VERSION,
-            PROTOCOL_VERSION,
-            "0",
-            self.identity,
-            (TASK,),
-            "f",
-            self._shape.slots,
-            NUMERIC_PACKAGES,
-            host_class=self.host_class,
-            anchor=proof_for(ANCHOR_KEY, self.identity) if self.is_anchor else "",
-        )
+        anchor = proof_for(ANCHOR_KEY, self.identity) if self.is_anchor else ""
+        offered = self.identity, (TASK,), "f", self._shape.slots, NUMERIC_PACKAGES
+        versions = PROTOCOL_VERSION, PROTOCOL_VERSION, "0"
+        request = HelloRequest(*versions, *offered, host_class=self.host_class, anchor=anchor)
         self._send((request, self._question))
 
     def _take(self, event: JobBatch | Token, now: float) -> None:

@@ -19,7 +19,7 @@ from dreamfleet.coordinator.run.run import BY_HAND
 from tests.simulation import books
 from tests.simulation.coordinator import COMMITTED, LINGER, OPENED, TICK, Coordinator, simulated_surroundings
 from tests.simulation.disk import Disk
-from tests.simulation.network import LATENCY, Link, Way
+from tests.simulation.network import LATENCY, Link
 from tests.simulation.schedule import Schedule, Shape
 from tests.simulation.truth import HopelessError, settings_of, truth_of
 from tests.simulation.violation import Violation
@@ -102,7 +102,7 @@ class World:
             self.later(fault.at, strike, self, fault)
         for host, at in self.bars.items():
             self.later(at, self.bar, host)
-        self.later(self._calm_at, self._calm)
+        self.later(self._calm_at, setattr, self, "kill", None)
         while not self._done:
             self.now, _, action, arguments = heapq.heappop(self._heap)
             self.events += 1
@@ -131,7 +131,7 @@ class World:
         self._inbox.clear()
         self._pause_finally()
         if life.over:
-            self._end_run()
+            self._done = True
             return
         for host in range(self.shape.workers):
             self.later(0.03 + 0.01 * host, self.look, host)
@@ -195,7 +195,7 @@ class World:
             self._check_workers()
         if life.run.state.ended is not None:
             books.check_end(life.fleet, life.run)
-            self._end_run()
+            self._done = True
             return
         self._pause_finally()
         if life.over:
@@ -219,23 +219,14 @@ class World:
             self._operator_called = life.draining = False
             life.run.resume()
 
-    def bar(self, host: int) -> None:
-        """Somebody says `dreamfleet bar HOST`, again until it is done."""
+    def bar(self, host: int, is_barred: bool = True) -> None:
+        """Somebody says `dreamfleet bar HOST`, or adds `--no-longer`, again until it is done."""
         name = f"w{host}"
         if self.coordinator is not None and not self.coordinator_stopped:
-            self.coordinator.run.bar(name)
+            self.coordinator.run.bar(name, is_barred=is_barred)
             self.wake_coordinator(LINGER)
-        if name not in self.disk.tables["barred"]:
-            self.later(OPERATOR, self.bar, host)
-
-    def unbar(self, host: int) -> None:
-        """Somebody says `dreamfleet bar HOST --no-longer`, again until it is done."""
-        name = f"w{host}"
-        if self.coordinator is not None and not self.coordinator_stopped:
-            self.coordinator.run.bar(name, is_barred=False)
-            self.wake_coordinator(LINGER)
-        if name in self.disk.tables["barred"]:
-            self.later(OPERATOR, self.unbar, host)
+        if (name in self.disk.tables["barred"]) != is_barred:
+            self.later(OPERATOR, self.bar, host, is_barred)
 
     def _pause_finally(self) -> None:
         """A run that shall fall silent is paused once its last generation is closed."""
@@ -250,9 +241,6 @@ class World:
         quiet = all(worker is not None and not worker.undelivered for worker in self.workers)
         return quiet and books.at_rest(life.fleet, life.run)
 
-    def _end_run(self) -> None:
-        self._done = True
-
     # The workers' side.
 
     def start_worker(self, host: int) -> None:
@@ -260,14 +248,11 @@ class World:
         if self.workers[host] is not None:
             return
         identity = f"w{host}/{next(self._names):08x}"
-        worker = Worker(
-            identity,
-            self.shape,
-            self._spec,
-            self.now,
-            lambda message: self._send_up(host, identity, message),
-            self.scored,
-        )
+
+        def send(message: Any) -> None:
+            self._send_up(host, identity, message)
+
+        worker = Worker(identity, self.shape, self._spec, self.now, send, self.scored)
         worker.lie, worker.is_anchor = self.lies.get(host, worker.lie), host in self.anchors
         worker.host_class = self.classes.get(host, worker.host_class)
         self.workers[host] = worker
@@ -371,8 +356,7 @@ class World:
         self._transmit_down(host, send.identity, batch)
 
     def _transmit_down(self, host: int, identity: str, message: JobBatch | Welcome) -> None:
-        way: Way = "down"
-        for delay in self.links[host].fates(way, self.now):
+        for delay in self.links[host].fates("down", self.now):
             self.later(delay, self._arrive, host, identity, message)
 
     def _arrive(self, host: int, identity: str, message: JobBatch | Welcome) -> None:
@@ -392,34 +376,26 @@ class World:
 
     # The end.
 
-    def _calm(self) -> None:
-        """From now on nothing is disturbed."""
-        self.kill = None
-
     def _give_up(self) -> None:
         life = self.coordinator
         if life is not None and self.is_silent:
             books.check_rest(life.fleet, life.run)
             held = {worker.identity: worker.undelivered for worker in self.workers if worker is not None}
             raise Violation("memory", f"workers of a paused run hold {held}")
-        state = (
-            "no coordinator" if life is None else f"generation {life.run.generation.number} is open, {life.run.state!r}"
-        )
-        raise Violation(
-            "liveness", f"{state}, {self.now - self._calm_at:.0f} s after the last fault, {self.events} events"
-        )
+        run = None if life is None else life.run
+        state = "no coordinator" if run is None else f"generation {run.generation.number} is open, {run.state!r}"
+        since = f"{self.now - self._calm_at:.0f} s after the last fault, {self.events} events"
+        raise Violation("liveness", f"{state}, {since}")
 
     def _check_waste(self) -> None:
         """What is scored beyond what counts was lost by a fault, one worker's hands at most each."""
         if self.happened["bar"]:
             return  # all that a host ever brought and checked is scored again
         checked = sum(bool(checker) for _, _, checker, _ in self.disk.tables["verification"].values())
-        background_jobs = self.scored.steps / 100 - self.counted_jobs - checked - self.scored.failures
-        hands = 3 * self.shape.slots * min(self.shape.width, self.shape.most_jobs)
-        if background_jobs > hands * (2 + len(self.schedule.faults)):
-            raise Violation(
-                "waste", f"{background_jobs:.0f} jobs were scored in vain under {len(self.schedule.faults)} faults"
-            )
+        vain = self.scored.steps / 100 - self.counted_jobs - checked - self.scored.failures
+        hands, faults = 3 * self.shape.slots * min(self.shape.width, self.shape.most_jobs), len(self.schedule.faults)
+        if vain > hands * (2 + faults):
+            raise Violation("waste", f"{vain:.0f} jobs were scored in vain under {faults} faults")
 
     @property
     def counted_jobs(self) -> int:

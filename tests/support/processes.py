@@ -38,6 +38,13 @@ def call_here(*words):
     return code, out.getvalue(), err.getvalue()
 
 
+def printed(*words):
+    """What a verb prints that ends well in this process."""
+    code, out, err = call_here(*words)
+    assert code == 0, err
+    return out
+
+
 def environment(cache, root=ROOT):
     inherited = {name: value for name, value in os.environ.items() if name != "SDL_VIDEODRIVER"}  # as in a user's shell
     return {

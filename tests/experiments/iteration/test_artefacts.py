@@ -1,17 +1,18 @@
-"""The files of an iteration: missed when they are needed, and undone. Tests layout.py."""
+"""The files of an iteration: missed when they are needed, and undone. Tests layout.py and phases.py."""
 
 import pytest
 
-from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.experiments.iteration import artefacts, phases
 from dreamfleet.experiments.iteration.config import IterateConfig
 from dreamfleet.experiments.iteration.layout import IterationFolder
-from dreamfleet.experiments.iteration.phases import PhaseRunner
 from dreamfleet.experiments.iteration.plan import Phase, PhasePlan
 from dreamfleet.experiments.iteration.requests import Requests
 from dreamfleet.worker.training.stages.encode import encode_drives
 from tests.support.ledgers import entry, ledger
+from tests.support.variants import controller_of
 
 
 def write(path, text="content"):
@@ -48,30 +49,27 @@ def finished(layout):
     )
 
 
-def test_what_is_there_as_it_was_made_is_no_fault(layout, finished):
-    assert artefacts.check(layout, finished) is None
-
-
 @pytest.mark.parametrize(
     ("path", "phase"),
     [("episodes/000001.npz", "1/collect"), ("episodes/000002.npz", "2/drive"), ("rounds/02/round-2.zip", "2/bundle"),
      ("runs/round-01/controller.npz", "1/evolve")],
 )  # fmt: skip
 def test_damage_names_the_file_and_the_command_that_makes_it_again(layout, finished, path, phase):
-    (layout.root / path).write_text("other")
-    with pytest.raises(DatasetError, match=rf"{path} .* --redo {phase}$"):
-        artefacts.check(layout, finished)
-    (layout.root / path).unlink()
-    with pytest.raises(DatasetError, match=rf"{path} .* --redo {phase}$"):
-        artefacts.check(layout, finished)
+    artefacts.check(layout, finished)
+    for damage in (lambda file: file.write_text("other"), lambda file: file.unlink()):
+        damage(layout.root / path)
+        with pytest.raises(DatasetError, match=rf"{path} .* --redo {phase}$"):
+            artefacts.check(layout, finished)
 
 
 def test_models_that_nobody_asks_for_any_more_may_go(layout, finished):
-    later = finished.add(entry(2, "gate", kept=True)).add(entry(2, "evolve")).add(entry(3, "drive", episodes=3))
     layout.bundle(1).unlink()
     layout.checkpoint(1, "vae").unlink()
-    artefacts.check(layout, later)
-    refused = finished.add(entry(2, "gate", kept=False)).add(entry(2, "evolve")).add(entry(3, "drive", episodes=3))
+    passed, refused = (
+        finished.add(entry(2, "gate", kept=kept)).add(entry(2, "evolve")).add(entry(3, "drive", episodes=3))
+        for kept in (True, False)
+    )
+    artefacts.check(layout, passed)
     with pytest.raises(DatasetError, match=r"vae\.safetensors"):
         artefacts.check(layout, refused)
 
@@ -108,6 +106,13 @@ def test_random_drives_are_driven_again_only_where_they_are_damaged(layout, fini
     assert [each.stem for each in artefacts.drive_files(layout)] == ["000000"]
 
 
+def test_no_training_goes_on_from_a_rounded_world_model(tmp_path):
+    controller_of(find_bundle("tiny-int8")).save(tmp_path / "own.npz")
+    whole = find_bundle("tiny").sha256[:12]
+    with pytest.raises(UsageError, match=rf"own\.npz .* tiny .*{whole}"):
+        phases.find_init(str(tmp_path / "own.npz"), tmp_path)
+
+
 @pytest.mark.parametrize("phase", ["mdnrnn", "bundle"])
 def test_latents_are_made_again_where_they_are_needed(layout, phase, monkeypatch):
     asked = []
@@ -120,5 +125,5 @@ def test_latents_are_made_again_where_they_are_needed(layout, phase, monkeypatch
     monkeypatch.setattr(phases, "run_isolated", run)
     requests = Requests(IterateConfig(), layout, ledger())
     with pytest.raises(DatasetError):
-        PhaseRunner(requests, None, never_stop, asked.append).do(Phase(1, phase))
+        phases.PhaseRunner(requests, None, never_stop, asked.append).do(Phase(1, phase))
     assert asked == ["encode_drives", "build_bundle" if phase == "bundle" else "train_model"]

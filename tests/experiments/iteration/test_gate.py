@@ -37,8 +37,9 @@ def test_the_verdict_names_the_figures():
 
 
 def test_what_could_not_be_measured_of_both_refuses_nothing():
-    assert judge({KNOWS: None, LOSES: None}, both()).kept
-    assert judge(both(), {KNOWS: None, LOSES: None}).kept
+    nothing = {KNOWS: None, LOSES: None}
+    assert judge(nothing, both()).kept
+    assert judge(both(), nothing).kept
 
 
 def known(value, error):
@@ -46,8 +47,8 @@ def known(value, error):
 
 
 def losses(*begun):
-    return LossReport(4, 8, 1.0, 10, tuple(RoadLossComparison(name, 4, {"lost": {"dream": Estimate(*lost)}})
-                                           for name, *lost in begun))  # fmt: skip
+    rows = (RoadLossComparison(name, 4, {"lost": {"dream": Estimate(*lost)}}) for name, *lost in begun)
+    return LossReport(4, 8, 1.0, 10, tuple(rows))
 
 
 def test_the_figures_are_of_what_was_measured():
@@ -68,9 +69,8 @@ def test_a_figure_without_both_kinds_of_beginnings_or_errors_is_none(found):
 
 
 def test_a_model_whose_dreams_live_less_as_reality_does_is_refused():
-    better, worse = (
-        figures({"survival": Survival(40, 1.0, 300, "drawn", (), Estimate(value, 0.01))}) for value in (-0.1, -0.7)
-    )
+    lives = [Survival(40, 1.0, 300, "drawn", (), Estimate(value, 0.01)) for value in (-0.1, -0.7)]
+    better, worse = (figures({"survival": each}) for each in lives)
     assert better[SURVIVES] == Figure(-0.1, 0.01)
     assert judge(worse, better).kept
     assert not judge(better, worse).kept

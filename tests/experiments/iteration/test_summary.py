@@ -43,12 +43,9 @@ def test_a_round_says_whose_model_it_evolved_in():
     assert summary.format_score(rounds[1]["score"]) == "900.0 ± 15.2 on 32 tracks, provisional"
 
 
-def test_a_round_in_its_midst_has_no_model_that_was_kept():
+def test_a_round_in_its_midst_has_no_model_that_was_kept_and_without_a_score_none_is_best():
     for begun in (SECOND[:1], SECOND[:2]):
         assert summary.table_rows(describe_rounds(*FIRST, *begun))[-1]["model"] is None
-
-
-def test_rounds_without_a_score_have_no_best_one():
     assert summary.best_round(describe_rounds(*FIRST[:2])) is None
 
 

@@ -25,6 +25,13 @@ SOURCES = {"flags": argparse.Namespace(), "environment": {}, "file": {}}
 FLAGS = ("--task=gym:CartPole-v1", "--generations=2")
 
 
+@pytest.fixture
+def folder(tmp_path):
+    found = SweepFolder(tmp_path, "carts")
+    found.path.mkdir()
+    return found
+
+
 def sweep_of(*vary, flags=FLAGS, name="carts"):
     return Sweep(name, parse_vary(vary), flags)
 
@@ -84,9 +91,8 @@ def test_a_worker_announces_all_tasks_that_its_flags_name():
     assert parsed.task == ["gym:mine:Own-v0", "mine:Task"]
 
 
-def test_a_sweep_is_kept_and_read_as_it_was(tmp_path):
-    sweep, folder = sweep_of("seed=1..2", "sigma0=0.05,0.1"), SweepFolder(tmp_path, "carts")
-    folder.path.mkdir()
+def test_a_sweep_is_kept_and_read_as_it_was(folder):
+    sweep = sweep_of("seed=1..2", "sigma0=0.05,0.1")
     stored = StoredSweep(sweep, ("gym:CartPole-v1",))
     folder.write(stored)
     assert folder.read() == stored
@@ -104,9 +110,7 @@ def resumed(*words):
     return sweep_verb._options(args, {}, kept)
 
 
-def test_a_sweep_is_resumed_as_it_was_served(tmp_path):
-    folder = SweepFolder(tmp_path, "carts")
-    folder.path.mkdir()
+def test_a_sweep_is_resumed_as_it_was_served(folder):
     kept = resumed()
     assert kept == SweepOptions(2, 6, ("tcp/0.0.0.0:7447",), (), insecure=True)
     folder.write(StoredSweep(sweep_of("seed=1..2"), (), kept))
@@ -116,35 +120,30 @@ def test_a_sweep_is_resumed_as_it_was_served(tmp_path):
     assert resumed("--listen", "tcp/127.0.0.1:1") == SweepOptions(2, 6, ("tcp/127.0.0.1:1",))
 
 
-def test_a_sweep_that_is_absent_or_damaged_is_named(tmp_path):
-    folder = SweepFolder(tmp_path, "carts")
+def test_a_sweep_that_is_absent_or_damaged_is_named(folder):
     with pytest.raises(UsageError, match="carts"):
         folder.read()
-    folder.path.mkdir()
     for text in ("{", "[]", '{"name": "carts"}', "null"):
         (folder.path / SETTINGS).write_text(text)
         with pytest.raises(DreamfleetError, match=r"sweep\.json"):
             folder.read()
 
 
-def result(name, setting, scores, *, ended=True):
-    return RunResult(name, setting, ended, scores, (), ())
+def result(setting, scores, *, ended=True):
+    return RunResult("a run", setting, ended, scores, (), ())
 
 
 def test_settings_are_compared_by_the_strongest_score_that_all_runs_have():
-    confirmed, other = result("a", "s", {CONFIRMED: 1.0, FITNESS: 5.0}), result("b", "s", {FITNESS: 3.0})
+    confirmed, other = result("s", {CONFIRMED: 1.0, FITNESS: 5.0}), result("s", {FITNESS: 3.0})
     assert judged_by([confirmed]) == CONFIRMED
     assert judged_by([confirmed, other]) == FITNESS
     assert judged_by([]) is None
-    assert judged_by([result("c", "s", {FITNESS: 1.0}, ended=False)]) is None
+    assert judged_by([result("s", {FITNESS: 1.0}, ended=False)]) is None
 
 
 def test_a_setting_has_the_mean_of_its_finished_runs_and_the_error_among_them():
-    runs = [
-        result("a", "one", {FITNESS: 1.0}), result("b", "one", {FITNESS: 3.0}),
-        result("c", "one", {FITNESS: 99.0}, ended=False), result("d", "two", {FITNESS: 7.0}),
-    ]  # fmt: skip
-    one, two = summary.means(runs, FITNESS)
+    runs = [result("one", {FITNESS: 1.0}), result("one", {FITNESS: 3.0}), result("two", {FITNESS: 7.0})]
+    one, two = summary.means([*runs, result("one", {FITNESS: 99.0}, ended=False)], FITNESS)
     assert (one.setting, one.runs, one.mean, one.error) == ("one", 2, 2.0, 1.0)
     assert (two.runs, two.mean, two.error) == (1, 7.0, None)
 

@@ -5,9 +5,8 @@ import asyncio
 import json
 import re
 import shutil
-import sqlite3
 import threading
-from contextlib import closing
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -21,22 +20,15 @@ from dreamfleet.coordinator.addons.dashboard.config import DashboardConfig
 from dreamfleet.coordinator.addons.dashboard.feed import Feed
 from dreamfleet.coordinator.addons.dashboard.live_runs import Watcher
 from dreamfleet.coordinator.addons.dashboard.view_processes import ViewProcesses
+from tests.support.journals import change_journal
 from tests.support.processes import DEADLINE
 
-RUNS = Path(__file__).parents[3] / "fixtures" / "runs"
 HOME = "http://127.0.0.1:8420"
 TOKEN = "correct horse battery"
 PATHS = (
     "/", "/runs", "/runs/dream", "/hosts/dream", "/compare/dream/reality", "/live", "/view?run=night", "/metrics",
     "/files/0/main.js",
 )  # fmt: skip
-
-
-@pytest.fixture
-def runs(tmp_path):
-    for name in ("dream", "reality", "hidden"):
-        shutil.copytree(RUNS / name, tmp_path / "runs" / name)
-    return tmp_path / "runs"
 
 
 def client_of(runs, host="127.0.0.1", base=HOME, **config):
@@ -47,8 +39,17 @@ def client_of(runs, host="127.0.0.1", base=HOME, **config):
     return TestClient(app, base_url=base, follow_redirects=False)
 
 
-def test_the_pages_files_load_and_may_be_cached_for_ever(runs):
-    client = client_of(runs)
+@pytest.fixture
+def client(runs):
+    return client_of(runs)
+
+
+@pytest.fixture
+def guarded(runs):
+    return client_of(runs, "0.0.0.0", "http://night.example:8420", token=TOKEN)
+
+
+def test_the_pages_files_load_and_may_be_cached_for_ever(client):
     page = client.get("/")
     assert page.headers["cache-control"] == "no-store"
     found = re.findall(r'(?:src|href)="(files/[^"]+)"', page.text)
@@ -64,19 +65,28 @@ def test_the_pages_files_load_and_may_be_cached_for_ever(runs):
         assert client.get(f"/{folder}/{name}").status_code == 200
 
 
-def test_the_page_holds_no_script_of_its_own_and_names_no_other_host(runs):
-    client = client_of(runs)
-    text = client.get("/").text
-    assert "http" not in text
-    assert not re.search(r"<script(?![^>]*\bsrc=)|\son\w+=|style=", text)
-    policy = client.get("/").headers["content-security-policy"]
+def test_the_page_holds_no_script_of_its_own_and_names_no_other_host(client):
+    answer = client.get("/")
+    assert "http" not in answer.text
+    assert not re.search(r"<script(?![^>]*\bsrc=)|\son\w+=|style=", answer.text)
+    policy = answer.headers["content-security-policy"]
     assert "script-src 'self';" in policy
     assert "default-src 'none'" in policy
 
 
-@pytest.mark.parametrize("path", ["/files/0/main.js", "/files/x/../../past.py", "/nothing", "/runs/nothing"])
-def test_what_is_not_there_is_404(runs, path):
-    assert client_of(runs).get(path).status_code == 404
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/files/0/main.js",
+        "/files/x/../../past.py",
+        "/nothing",
+        "/runs/nothing",
+        "/hosts/nothing",
+        "/compare/reality/no",
+    ],
+)
+def test_what_is_not_there_is_404(client, path):
+    assert client.get(path).status_code == 404
 
 
 def test_past_runs_are_listed_with_what_is_wrong_with_them(runs):
@@ -91,20 +101,16 @@ def test_past_runs_are_listed_with_what_is_wrong_with_them(runs):
     assert rows["dream"]["best_error"] > 0
 
 
-def test_only_an_open_run_is_listed_with_its_resume_command(runs):
-    with closing(sqlite3.connect(runs / "dream" / "journal.sqlite")) as journal, journal:
-        journal.execute("INSERT OR REPLACE INTO run VALUES ('ended', '2 minutes')")
-    client = client_of(runs)
+def test_only_an_open_run_is_listed_with_its_resume_command(runs, client):
     assert client.get("/runs/dream").json()["again"] == ""
-    with closing(sqlite3.connect(runs / "dream" / "journal.sqlite")) as journal, journal:
-        journal.execute("DELETE FROM run WHERE key = 'ended'")
+    change_journal(runs / "dream", "DELETE FROM run WHERE key = 'ended'")
     rows = {each["run"]: each for each in client.get("/runs").json()["runs"]}
     assert f"coordinator --resume dream --runs-dir {runs}" in rows["dream"]["again"]
     assert client.get("/runs/dream").json()["again"] == rows["dream"]["again"]
 
 
-def test_a_run_is_its_curves_facts_and_settings(runs):
-    document = client_of(runs).get("/runs/dream").json()
+def test_a_run_is_its_curves_facts_and_settings(client):
+    document = client.get("/runs/dream").json()
     curves = document["curves"]
     assert curves["generation"] == list(range(12))
     assert all(low <= high for low, high in zip(curves["low"], curves["high"], strict=True))
@@ -117,80 +123,72 @@ def test_a_run_is_its_curves_facts_and_settings(runs):
     assert document["tiles"][0]["name"] == "score"
 
 
-def test_two_runs_are_compared_as_by_the_verb(runs):
-    client = client_of(runs)
+def test_two_runs_are_compared_as_by_the_verb(runs, client):
     shutil.copytree(runs / "reality", runs / "again")
     found = client.get("/compare/reality/again").json()
     assert found["settings"] == []
     assert [each["size"].split()[-1] for each in found["differences"]] == ["0", "0"]
-    assert client.get("/compare/reality/nothing").status_code == 404
+    (runs / "dream" / "bundle.zip").unlink()
     lacking = client.get("/compare/reality/dream").json()
     assert lacking["problem"], "its world is unknown"
     assert lacking["differences"] == []
     assert ["seed", "11", "12"] in lacking["settings"]
 
 
-def test_hosts_are_those_of_the_journal(runs):
-    found = client_of(runs).get("/hosts/reality").json()
+def test_hosts_are_those_of_the_journal(client):
+    found = client.get("/hosts/reality").json()
     (host,) = found["hosts"]
     assert (host["host"], host["lives"], host["steps"]) == ("vm", 1, 5053)
     assert sum(host["rate"]) * found["width"] == pytest.approx(5053, rel=1e-3)
-    assert client_of(runs).get("/hosts/nothing").status_code == 404
 
 
-def test_a_run_that_closed_no_generation_is_shown(runs):
-    with closing(sqlite3.connect(runs / "dream" / "journal.sqlite")) as journal, journal:
-        for table in ("generation", "candidate", "evaluation", "result", "strategy"):
-            journal.execute(f"DELETE FROM {table}")
-    document = client_of(runs).get("/runs/dream").json()
+def test_a_run_that_closed_no_generation_is_shown(runs, client):
+    for table in ("generation", "candidate", "evaluation", "result", "strategy"):
+        change_journal(runs / "dream", f"DELETE FROM {table}")
+    document = client.get("/runs/dream").json()
     assert (document["curves"]["generation"], document["generations"]) == ([], [])
 
 
-def test_a_journal_whose_generations_are_far_apart_is_damaged_and_not_counted_through(runs):
-    with closing(sqlite3.connect(runs / "dream" / "journal.sqlite")) as journal, journal:
-        journal.execute("UPDATE generation SET number = ? WHERE number = 3", (2**62,))
-    answer = client_of(runs).get("/runs/dream")
-    assert answer.status_code == 404
+def test_a_journal_whose_generations_are_far_apart_is_damaged_and_not_counted_through(runs, client):
+    change_journal(runs / "dream", "UPDATE generation SET number = ? WHERE number = 3", 2**62)
+    assert client.get("/runs/dream").status_code == 404
 
 
 @pytest.mark.parametrize(
     "name", ["..", "%2e%2e", "..%2f..%2fetc", "%2Fetc%2Fpasswd", "a%00b", "Dream", "x" * 300, "archive%2Fx"]
 )
-def test_no_name_leads_out_of_the_runs_folder(runs, name):
+def test_no_name_leads_out_of_the_runs_folder(runs, client, name):
     shutil.copytree(runs / "dream", runs.parent / "outside")
     for path in (f"/runs/{name}", f"/hosts/{name}", f"/compare/reality/{name}"):
-        answer = client_of(runs).get(path)
+        answer = client.get(path)
         assert answer.status_code in (404, 200)  # the client removes `..` from a path, and then requests the page
         assert not {"curves", "width", "differences"} & set(re.findall(r'"(\w+)":', answer.text))
 
 
 @pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS"])
-@pytest.mark.parametrize("path", PATHS)
-def test_only_get_is_allowed(runs, method, path):
-    assert client_of(runs).request(method, path).status_code == 405
+def test_only_get_is_allowed(client, method):
+    assert {client.request(method, path).status_code for path in PATHS} == {405}
 
 
 @pytest.mark.parametrize(
     "host", ["evil.example", "evil.example:8420", "127.0.0.1.evil.example", "localhost.evil.example", ""]
 )
-@pytest.mark.parametrize("path", PATHS)
-def test_a_foreign_host_name_that_resolves_here_is_refused(runs, host, path):
-    answer = client_of(runs).get(path, headers={"host": host})
-    assert (answer.status_code, "127.0.0.1" in answer.text) == (421, True)
+def test_a_foreign_host_name_that_resolves_here_is_refused(client, host):
+    for path in PATHS:
+        answer = client.get(path, headers={"host": host})
+        assert (answer.status_code, "127.0.0.1" in answer.text) == (421, True), path
 
 
 @pytest.mark.parametrize("site", ["cross-site", "same-site"])
-@pytest.mark.parametrize("path", PATHS)
-def test_another_sites_page_may_link_here_and_request_nothing_else(runs, site, path):
-    client = client_of(runs)
-    for mode in ("cors", "no-cors", "navigate"):
+def test_another_sites_page_may_link_here_and_request_nothing_else(client, site):
+    for path, mode in product(PATHS, ("cors", "no-cors", "navigate")):
         answer = client.get(path, headers={"sec-fetch-site": site, "sec-fetch-mode": mode})
         assert answer.status_code == (200 if (path, mode) == ("/", "navigate") else 403)
 
 
 @pytest.mark.parametrize("path", ["/live", "/view?run=night"])
-def test_head_of_an_endless_stream_gets_headers_only(runs, path):
-    answer = client_of(runs).head(path)
+def test_head_of_an_endless_stream_gets_headers_only(client, path):
+    answer = client.head(path)
     assert (answer.status_code, answer.headers["content-type"]) == (200, "text/event-stream; charset=utf-8")
 
 
@@ -198,65 +196,58 @@ def test_head_of_an_endless_stream_gets_headers_only(runs, path):
     "asked", ["", "run=", "run=a/b", "run=a&worker=--out", "run=a&worker=a/../b", "run=a&worker=a/0a1b2c3d%0a",
               "run=a&generation=-1", "run=a&generation=1;2", "run=a&generation=%D9%A1x", "run=--help"],
 )  # fmt: skip
-def test_what_cannot_be_watched_is_refused_in_words(runs, asked):
-    answer = client_of(runs).get(f"/view?{asked}")
+def test_what_cannot_be_watched_is_refused_in_words(client, asked):
+    answer = client.get(f"/view?{asked}")
     assert (answer.status_code, answer.text.count("\n")) == (400, 1)
 
 
 @pytest.mark.parametrize("host", ["localhost:8420", "127.0.0.1", "[::1]:8420", "LOCALHOST"])
-def test_own_names_are_answered(runs, host):
-    assert client_of(runs).get("/", headers={"host": host}).status_code == 200
+def test_own_names_are_answered(client, host):
+    assert client.get("/", headers={"host": host}).status_code == 200
 
 
-@pytest.mark.parametrize("path", PATHS)
-def test_without_the_token_there_is_a_page_that_asks_for_it(runs, path):
-    client = client_of(runs, "0.0.0.0", "http://night.example:8420", token=TOKEN)
-    wrong = (("authorization", "Bearer wrong"), ("authorization", f"Basic {TOKEN}"), ("cookie", "dreamfleet=wrong"),
-             ("cookie", f"dreamfleet={TOKEN}"))  # fmt: skip
-    for headers in ({}, *({name: value} for name, value in wrong)):
-        answer = client.get(path, headers=headers)
-        assert answer.status_code == 401
-    answer = client.get(path, params={"token": "wrong<script>"})
-    assert (answer.status_code, "<script>" in answer.text) == (401, False)
+def test_without_the_token_there_is_a_page_that_asks_for_it(guarded):
+    wrong = ({}, {"authorization": "Bearer wrong"}, {"authorization": f"Basic {TOKEN}"},
+             {"cookie": "dreamfleet=wrong"}, {"cookie": f"dreamfleet={TOKEN}"})  # fmt: skip
+    for path in PATHS:
+        assert {guarded.get(path, headers=headers).status_code for headers in wrong} == {401}, path
+        answer = guarded.get(path, params={"token": "wrong<script>"})
+        assert (answer.status_code, "<script>" in answer.text) == (401, False), path
 
 
-def test_the_token_opens_by_bearer_and_by_an_address_that_leaves_a_cookie(runs):
-    client = client_of(runs, "0.0.0.0", "http://night.example:8420", token=TOKEN)
-    assert client.get("/runs", headers={"authorization": f"Bearer {TOKEN}"}).status_code == 200
-    answer = client.get("/", params={"token": TOKEN})
+def test_the_token_opens_by_bearer_and_by_an_address_that_leaves_a_cookie(guarded):
+    assert guarded.get("/runs", headers={"authorization": f"Bearer {TOKEN}"}).status_code == 200
+    answer = guarded.get("/", params={"token": TOKEN})
     assert (answer.status_code, answer.headers["location"]) == (303, "/")
     cookie = answer.headers["set-cookie"]
     assert TOKEN not in cookie
     assert "HttpOnly" in cookie
     assert "samesite=lax" in cookie.lower()
-    assert client.get("/runs").status_code == 200
+    assert guarded.get("/runs").status_code == 200
 
 
-def test_no_redirect_leads_elsewhere(runs):
-    client = client_of(runs, "0.0.0.0", "http://night.example:8420", token=TOKEN)
-    for path in ("/runs", "/%2F/evil.example", "/https:%2F%2Fevil.example"):
-        assert client.get(path, params={"token": TOKEN}).headers["location"] == "/"
+@pytest.mark.parametrize("path", ["/runs", "/%2F/evil.example", "/https:%2F%2Fevil.example"])
+def test_no_redirect_leads_elsewhere(guarded, path):
+    assert guarded.get(path, params={"token": TOKEN}).headers["location"] == "/"
 
 
-def test_every_answer_has_the_security_headers(runs):
-    client = client_of(runs)
-    for path in ("/", "/runs", "/runs/nothing", "/nothing"):
-        headers = client.get(path).headers
-        assert headers["x-content-type-options"] == "nosniff"
-        assert "frame-ancestors 'none'" in headers["content-security-policy"]
-        assert headers["cross-origin-resource-policy"] == "same-origin"
+@pytest.mark.parametrize("path", ["/", "/runs", "/runs/nothing", "/nothing"])
+def test_every_answer_has_the_security_headers(client, path):
+    headers = client.get(path).headers
+    assert headers["x-content-type-options"] == "nosniff"
+    assert "frame-ancestors 'none'" in headers["content-security-policy"]
+    assert headers["cross-origin-resource-policy"] == "same-origin"
 
 
-def test_no_answer_holds_nan_or_infinity(runs):
-    with closing(sqlite3.connect(runs / "dream" / "journal.sqlite")) as journal, journal:
-        journal.execute("UPDATE generation SET mean = 9e999, best = -9e999 WHERE number = 2")
-        journal.execute("UPDATE candidate SET fitness = 9e999 WHERE generation = 2")
+def test_no_answer_holds_nan_or_infinity(runs, client):
+    change_journal(runs / "dream", "UPDATE generation SET mean = 9e999, best = -9e999 WHERE number = 2")
+    change_journal(runs / "dream", "UPDATE candidate SET fitness = 9e999 WHERE generation = 2")
 
     def refuse(word):
         raise AssertionError(word)
 
     for path in ("/runs", "/runs/dream", "/hosts/dream"):
-        answer = client_of(runs).get(path)
+        answer = client.get(path)
         assert answer.status_code == 200
         json.loads(answer.text, parse_constant=refuse)
 

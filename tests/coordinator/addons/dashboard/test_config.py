@@ -6,25 +6,23 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.coordinator.addons.dashboard.config import DashboardConfig
 
 TOKEN = "correct horse battery"
+REACHABLE = ("0.0.0.0", "::", "192.168.1.5", "example.org", "")
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.7", "localhost", "::1"])
-def test_a_loopback_address_needs_no_token(host):
-    assert DashboardConfig(host=host).is_loopback
-
-
-@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "example.org", ""])
-def test_any_other_address_needs_one(host):
-    with pytest.raises(UsageError, match="--token"):
-        DashboardConfig(host=host)
-    assert not DashboardConfig(host=host, token=TOKEN).is_loopback
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.7", "localhost", "::1", *REACHABLE])
+def test_only_a_loopback_address_needs_no_token(host):
+    config = DashboardConfig(host=host, token=TOKEN if host in REACHABLE else None)
+    assert config.is_loopback == (host not in REACHABLE)
 
 
 @pytest.mark.parametrize(
     ("changes", "named"),
-    [({"token": "short"}, r"--token.*\b12\b"), ({"port": -1}, "--port"), ({"port": 65536}, "--port")],
-)
-def test_what_is_no_address_or_token_is_refused(changes, named):
+    [
+        *(({"host": host}, "--token") for host in REACHABLE),
+        ({"token": "short"}, r"--token.*\b12\b"), ({"port": -1}, "--port"), ({"port": 65536}, "--port"),
+    ],
+)  # fmt: skip
+def test_what_is_no_address_or_token_or_lacks_one_is_refused(changes, named):
     with pytest.raises(UsageError, match=named):
         DashboardConfig(**changes)
 

@@ -1,7 +1,7 @@
 """The columns of the charts: bounded in number, and aligned."""
 
-import dataclasses
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -19,10 +19,10 @@ from dreamfleet.coordinator.addons.dashboard.curves import (
 from tests.support.samples import CLOSED, STATUS
 
 
-def data(generations, **changes):
-    history = [dataclasses.replace(CLOSED, number=number, mean=float(number)) for number in range(generations)]
+def data(generations, settings=STATUS.settings):
+    history = [replace(CLOSED, number=number, mean=float(number)) for number in range(generations)]
     looks = [StoredEvaluation(number, 16, 100.0 + number, 20.0) for number in range(4, generations, 5)]
-    return RunData(changes.pop("settings", STATUS.settings), history, looks, changes.pop("confirmed", None))
+    return RunData(settings, history, looks, None)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, MOST_POINTS, MOST_POINTS + 1, 1234, 5000, 99_999])
@@ -37,8 +37,7 @@ def test_a_long_run_is_downsampled_and_keeps_its_ends(count):
 
 def test_columns_are_equally_long_and_the_band_says_what_it_is():
     drawn = curves(data(10), None)
-    lengths = {len(drawn[name]) for name in ("generation", "mean", "best", "low", "high", "sigma")}
-    assert lengths == {10}
+    assert {len(drawn[name]) for name in ("generation", "mean", "best", "low", "high", "sigma")} == {10}
     assert (drawn["low"][3], drawn["high"][3]) == (max(3.0 - CLOSED.std, CLOSED.worst), 3.0 + CLOSED.std)
     drawn = curves(data(10), {number: (number - 1.0, number + 2.0) for number in range(10)})
     assert (drawn["low"][3], drawn["high"][3]) == (2.0, 5.0)
@@ -47,8 +46,8 @@ def test_columns_are_equally_long_and_the_band_says_what_it_is():
 def test_only_a_dream_has_two_axes():
     plain = curves(data(3), None)
     assert (plain["dreamt"], "1,000" in plain["fitness_axis"]) == (False, True)
-    task = dataclasses.replace(STATUS.settings.task, task="dream", temperature=1.5)
-    dream = curves(data(3, settings=dataclasses.replace(STATUS.settings, task=task)), None)
+    task = replace(STATUS.settings.task, task="dream", temperature=1.5)
+    dream = curves(data(3, settings=replace(STATUS.settings, task=task)), None)
     assert (dream["dreamt"], "1,000" in dream["fitness_axis"], "16 seeds" in dream["score_axis"]) == (True, True, True)
 
 
@@ -71,7 +70,7 @@ def test_effort_includes_the_start_and_excludes_confirmations():
 
 def test_an_evaluation_of_an_open_generation_has_the_total_effort():
     spent = cumulative_effort(Effort(), [], 3)
-    odd = dataclasses.replace(data(3), evaluations=[StoredEvaluation(2**62, 1, 1.0, 0.0)])
+    odd = replace(data(3), evaluations=[StoredEvaluation(2**62, 1, 1.0, 0.0)])
     assert curves(odd, None, spent)["evaluations"]["steps"] == [0]
     assert curves(odd, None, spent)["evaluations"]["error"] == [None], "of one episode"
     empty = RunData(STATUS.settings, [], [], StoredConfirmation(3, 4, 1.0, 0.5, 9))
@@ -80,8 +79,7 @@ def test_an_evaluation_of_an_open_generation_has_the_total_effort():
 
 @pytest.mark.parametrize("strange", [math.inf, -math.inf, math.nan, 1.797e308])
 def test_a_number_that_cannot_be_drawn_is_a_gap(strange):
-    history = [dataclasses.replace(CLOSED, number=0, mean=strange, best=strange)]
+    history = [replace(CLOSED, number=0, mean=strange, best=strange)]
     drawn = curves(RunData(STATUS.settings, history, [], None), None)
-    assert all(
-        value is None or math.isfinite(value) for name in ("mean", "low", "high", "best") for value in drawn[name]
-    )
+    for name in ("mean", "low", "high", "best"):
+        assert all(value is None or math.isfinite(value) for value in drawn[name])

@@ -2,6 +2,7 @@
 
 import asyncio
 import threading
+from functools import wraps
 
 import pytest
 
@@ -32,8 +33,14 @@ class Looks:
         self.rests += 1
 
 
-def run(coroutine):
-    asyncio.run(asyncio.wait_for(coroutine, 20))
+def played(test):
+    """A test that is a coroutine, in a loop of its own."""
+
+    @wraps(test)
+    def play(looks):
+        asyncio.run(asyncio.wait_for(test(looks), 20))
+
+    return play
 
 
 @pytest.fixture
@@ -42,7 +49,8 @@ def looks():
 
 
 @pytest.mark.slow
-def test_all_viewers_share_the_snapshots(looks):
+@played
+async def test_all_viewers_share_the_snapshots(looks):
     looks.are_single = True
 
     async def viewer(feed, snapshots, everybody):
@@ -53,53 +61,44 @@ def test_all_viewers_share_the_snapshots(looks):
                 looks.gate.set()
         return seen
 
-    async def play():
-        feed, everybody = Feed(looks, refresh=0.01, linger=0.05), asyncio.Barrier(50)
-        found = await asyncio.gather(*(viewer(feed, 3, everybody) for _ in range(50)))
-        assert len({tuple(map(id, seen)) for seen in found}) == 1
-        assert looks.count <= 6, "the second failed, and cost itself alone"
-
-    run(play())
+    feed, everybody = Feed(looks, refresh=0.01, linger=0.05), asyncio.Barrier(50)
+    found = await asyncio.gather(*(viewer(feed, 3, everybody) for _ in range(50)))
+    assert len({tuple(map(id, seen)) for seen in found}) == 1
+    assert looks.count <= 6, "the second failed, and cost itself alone"
 
 
-def test_a_slow_viewer_skips_snapshots_and_delays_nobody(looks):
-    async def play():
-        feed = Feed(looks, refresh=0.0, linger=0.05)
-        slow, fast = feed.snapshots(), feed.snapshots()
-        first = await anext(slow)
-        for _ in range(20):
-            last = await anext(fast)
-        assert int((await anext(slow)).absent_event) >= int(last.absent_event) > int(first.absent_event) + 10
-
-    run(play())
+@played
+async def test_a_slow_viewer_skips_snapshots_and_delays_nobody(looks):
+    feed = Feed(looks, refresh=0.0, linger=0.05)
+    slow, fast = feed.snapshots(), feed.snapshots()
+    first = await anext(slow)
+    for _ in range(20):
+        last = await anext(fast)
+    assert int((await anext(slow)).absent_event) >= int(last.absent_event) > int(first.absent_event) + 10
 
 
-def test_polling_stops_without_viewers_and_a_later_viewer_gets_no_stale_snapshot(looks):
-    async def play():
-        feed = Feed(looks, refresh=0.01, linger=0.02)
-        async for _ in feed.snapshots():
-            break
-        while looks.rests == 0:
-            await asyncio.sleep(0)
-        assert feed._polling is None
-        before = looks.count
-        looks.gate.clear()
-        later = asyncio.ensure_future(anext(feed.snapshots()))
-        while feed._polling is None:
-            await asyncio.sleep(0)
-        assert not later.done()
-        looks.gate.set()
-        assert int((await later).absent_event) > before
-
-    run(play())
+@played
+async def test_polling_stops_without_viewers_and_a_later_viewer_gets_no_stale_snapshot(looks):
+    feed = Feed(looks, refresh=0.01, linger=0.02)
+    async for _ in feed.snapshots():
+        break
+    while looks.rests == 0:
+        await asyncio.sleep(0)
+    assert feed._polling is None
+    before = looks.count
+    looks.gate.clear()
+    later = asyncio.ensure_future(anext(feed.snapshots()))
+    while feed._polling is None:
+        await asyncio.sleep(0)
+    assert not later.done()
+    looks.gate.set()
+    assert int((await later).absent_event) > before
 
 
-def test_closing_the_feed_ends_every_stream(looks):
-    async def play():
-        feed = Feed(looks, refresh=0.01, linger=10)
-        viewer = feed.snapshots()
-        await anext(viewer)
-        feed.close()
-        assert [picture async for picture in viewer] == []
-
-    run(play())
+@played
+async def test_closing_the_feed_ends_every_stream(looks):
+    feed = Feed(looks, refresh=0.01, linger=10)
+    viewer = feed.snapshots()
+    await anext(viewer)
+    feed.close()
+    assert [picture async for picture in viewer] == []

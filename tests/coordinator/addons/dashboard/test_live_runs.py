@@ -6,6 +6,8 @@ from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
 
+import pytest
+
 from dreamfleet.common.client.status import ArchiveStatus
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.transport.network import Network
@@ -19,17 +21,32 @@ from tests.support.samples import STATUS
 from tests.support.served import serving, snapshot
 
 
-def test_lanes_are_kept_while_polling_is_suspended(tmp_path, monkeypatch):
+@pytest.fixture
+def endpoint():
+    return f"tcp/127.0.0.1:{free_port()}"
+
+
+def watching(endpoint, runs, name="night"):
+    return live_runs.Watcher(Network(connect=(endpoint,)), name, runs)
+
+
+def look_of(watcher):
+    while (shown := watcher.poll().find("night")) is None:
+        pass  # a busy host may answer late
+    return shown
+
+
+def data_of(event):
+    return json.loads(event.decode().split("data: ")[1])
+
+
+def test_lanes_are_kept_while_polling_is_suspended(tmp_path, monkeypatch, endpoint):
     now = [1000.0]
     monkeypatch.setattr(live_runs, "time", SimpleNamespace(time=lambda: now[0], monotonic=time.monotonic))
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    watcher = live_runs.Watcher(Network(connect=(endpoint,)), None, tmp_path)
+    watcher = watching(endpoint, tmp_path, None)
 
     def lane():
-        while (shown := watcher.poll().find("night")) is None:
-            pass  # a busy host may answer late
-        _, data = shown.page_state.decode().split("data: ")
-        return json.loads(data)["workers"]["lane"][0]
+        return data_of(look_of(watcher).page_state)["workers"]["lane"][0]
 
     with serving(endpoint, snapshot(4, workers=1)):
         seen = lane()[-1]
@@ -40,35 +57,29 @@ def test_lanes_are_kept_while_polling_is_suspended(tmp_path, monkeypatch):
         watcher.suspend()
 
 
-def test_a_run_by_name_is_followed_among_more_runs_than_the_page_holds(tmp_path, monkeypatch):
+def test_a_run_by_name_is_followed_among_more_runs_than_the_page_holds(tmp_path, monkeypatch, endpoint):
     monkeypatch.setattr(live_runs, "MOST_RUNS", 1)
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    watcher = live_runs.Watcher(Network(connect=(endpoint,)), "night", tmp_path)
+    watcher = watching(endpoint, tmp_path)
     with serving(endpoint, snapshot(4), snapshot(4, name="day")):
-        while watcher.poll().find("night") is None:
-            pass  # a busy host may answer late
+        look_of(watcher)
         assert watcher.poll().find("day") is None
 
 
-def test_generations_that_were_recalled_and_scored_again_are_drawn_again(tmp_path):
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    watcher = live_runs.Watcher(Network(connect=(endpoint,)), "night", tmp_path)
+def test_generations_that_were_recalled_and_scored_again_are_drawn_again(tmp_path, endpoint):
+    watcher = watching(endpoint, tmp_path)
     first, again = snapshot(4), snapshot(4, incarnation=STATUS.incarnation + 1)
     again = replace(again, history=History(replace(each, mean=-7.5) for each in again.history.part(0, 4)).view())
-
     with serving(endpoint, first) as served:
-        while (before := watcher.poll().find("night")) is None:
-            pass  # a busy host may answer late
+        before = look_of(watcher)
         served.snapshot = again
-        while (after := watcher.poll().find("night")).curves == before.curves:
+        while (after := look_of(watcher)).curves == before.curves:
             pass
         watcher.suspend()
-    assert b"-7.5" in after.curves
-    assert b"-7.5" not in before.curves
+    assert [b"-7.5" in each.curves for each in (before, after)] == [False, True]
     assert after.curves_version != before.curves_version
 
 
-def test_a_live_runs_archive_is_drawn_from_its_journal_and_goes_on_after_a_restart(tmp_path, random_bundle):
+def test_a_live_runs_archive_is_drawn_from_its_journal_and_goes_on_after_a_restart(tmp_path, random_bundle, endpoint):
     axes = ("steps=0:4:4", "action0=0:1:2")
     spec = replace(SETTINGS.task, measures=("steps", "action0"))
     settings = replace(SETTINGS, task=spec, population=4, episodes=1, collect_every=0, archive=axes)
@@ -87,16 +98,13 @@ def test_a_live_runs_archive_is_drawn_from_its_journal_and_goes_on_after_a_resta
     looked = take_snapshot(bench.run, "night", Counter(), 0.0, bench.now)
     assert looked.status.archive == ArchiveStatus(8, 4, 0.0 + 1 + 2 + 4, 4.0, (3, 1))
     bench.journal.commit()
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    watcher = live_runs.Watcher(Network(connect=(endpoint,)), "night", tmp_path)
+    watcher = watching(endpoint, tmp_path)
     with serving(endpoint, looked):
-        while (shown := watcher.poll().find("night")) is None:
-            pass  # a busy host may answer late
+        shown = look_of(watcher)
         watcher.suspend()
     bench.journal.close()
-    drawn = json.loads(shown.curves.decode().split("data: ")[1])["archive"]
+    drawn = data_of(shown.curves)["archive"]
     assert drawn["z"] == [[None] * 4, [0.0, 1.0, 2.0, 4.0]]
     assert "4 of 8 cells filled" in drawn["caption"]
-    (tile,) = [each for each in json.loads(shown.page_state.decode().split("data: ")[1])["tiles"]
-               if each["name"] == "archive"]  # fmt: skip
-    assert tile["value"] == "4 of 8"
+    tiles = {each["name"]: each["value"] for each in data_of(shown.page_state)["tiles"]}
+    assert tiles["archive"] == "4 of 8"

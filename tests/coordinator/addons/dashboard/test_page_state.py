@@ -12,78 +12,74 @@ from dreamfleet.coordinator.addons.dashboard.page_state import RunSnapshot, page
 from tests.support.samples import STATUS
 
 
-def look(lost=None, folder=None, **changes):
+def shown(lost=None, folder=None, word="seed", **changes):
     status = replace(STATUS, **changes)
     lanes = ["9"] * len(status.worker_list)
-    return RunSnapshot(status, status.worker_list, lanes, (status.population,), 100.0, lost, folder)
+    return page_state(RunSnapshot(status, status.worker_list, lanes, (status.population,), 100.0, lost, folder, word))
+
+
+def tiles_of(document):
+    return {each["name"]: each for each in document["tiles"]}
 
 
 def momentary_values(document):
-    tiles = {each["name"]: each["value"] for each in document["tiles"]}
-    workers = document["workers"]
+    tiles, workers = tiles_of(document), document["workers"]
     columns = [value for name in ("state", "rate", "leases", "load", "heard") for value in workers[name]]
-    return [tiles["throughput"], tiles["fleet"], *columns]
+    return {tiles["throughput"]["value"], tiles["fleet"]["value"], *columns}
 
 
 @pytest.mark.parametrize("gone", [{"lost": 101.0}, {"state": "ended"}, {"state": "left"}])
 def test_only_a_live_run_shows_momentary_values(gone):
-    assert not {"-", None} & set(momentary_values(page_state(look())))
-    document = page_state(look(**gone))
-    assert set(momentary_values(document)) == {"-", None}
-    assert document["workers"]["finished"] == page_state(look())["workers"]["finished"], "finished jobs stay"
+    assert not {"-", None} & momentary_values(shown())
+    document = shown(**gone)
+    assert momentary_values(document) == {"-", None}
+    assert document["workers"]["finished"] == shown()["workers"]["finished"], "finished jobs stay"
 
 
 def test_no_generation_is_open_once_a_run_has_ended_or_only_its_mean_is_driven():
     opened = replace(STATUS.generation, episodes_done=0)
-    assert page_state(look(generation=opened))["candidates"]["total"] > 0
+    assert shown(generation=opened)["candidates"]["total"] > 0
     for state in ("ended", "evaluating"):
-        assert page_state(look(generation=opened, state=state))["candidates"]["total"] == 0
-    assert page_state(look(state="evaluating"))["candidates"]["total"] > 0, (
-        "it waits for the evaluation of the last mean"
-    )
+        assert shown(generation=opened, state=state)["candidates"]["total"] == 0
+    assert shown(state="evaluating")["candidates"]["total"] > 0, "it waits for the evaluation of the last mean"
 
 
 def test_a_lost_run_with_its_journal_here_shows_the_whole_command():
-    here = page_state(look(101.0, Path("/data/runs") / STATUS.run))["sentence"]
+    here = shown(101.0, Path("/data/runs") / STATUS.run)["sentence"]
     assert re.search(f"--resume {STATUS.run} --runs-dir /data/runs.*--join", here)
-    assert re.search(f"--resume {STATUS.run}.*--runs-dir.*--join", page_state(look(101.0))["sentence"])
+    assert re.search(f"--resume {STATUS.run}.*--runs-dir.*--join", shown(101.0)["sentence"])
 
 
 def test_generations_of_one_fitness_are_a_trouble():
-    assert len(page_state(look(failures=(), equal=ENOUGH))["troubles"]) == 1
-    assert page_state(look(failures=(), equal=ENOUGH - 1))["troubles"] == []
+    assert len(shown(failures=(), equal=ENOUGH)["troubles"]) == 1
+    assert shown(failures=(), equal=ENOUGH - 1)["troubles"] == []
 
 
 def test_a_refused_worker_is_told_as_long_as_the_run_goes_on():
     refused = {"vm": "no gymnasium"}
-    (trouble,) = page_state(look(refused=refused, failures=()))["troubles"]
+    (trouble,) = shown(refused=refused, failures=())["troubles"]
     assert re.search("vm.*no gymnasium", trouble)
-    assert page_state(look(refused=refused, failures=(), state="ended"))["troubles"] == []
+    assert shown(refused=refused, failures=(), state="ended")["troubles"] == []
 
 
 def test_failures_and_failed_episodes_are_named():
     failure = FailureStatus("4/0", "evaluate", (20003,), {"host-a": "no road"}, {"host-a": 2})
-    document = page_state(look(failures=(failure,), best=replace(STATUS.best, failed=1)))
+    document = shown(failures=(failure,), best=replace(STATUS.best, failed=1))
     (trouble,) = document["troubles"]
     assert re.search(r"\b4\b.*20003.*host-a.*2.*no road", trouble)
-    reported = next(each for each in document["tiles"] if each["name"] == "score")
-    assert re.search(r"\b4\b.*16 seeds.*1 ", reported["beneath"])
+    assert re.search(r"\b4\b.*16 seeds.*1 ", tiles_of(document)["score"]["beneath"])
 
 
 def test_a_running_run_says_each_fact_once():
-    document = page_state(look(state="running"))
-    assert document["sentence"] == "", "the open generation's card says it"
-    paused = page_state(look(state="paused", why="by hand"))
+    assert shown(state="running")["sentence"] == "", "the open generation's card says it"
+    paused = shown(state="paused", why="by hand")
     assert (paused["state"], paused["sentence"]) == ("paused", "By hand")
 
 
 def test_redundant_work_is_one_line_unless_it_is_not_zero():
-    zeros = {each.name: 0 for each in fields(STATUS.waste)}
-    nothing = look(waste=replace(STATUS.waste, **zeros), dropped={"malformed": 0})
-    assert page_state(nothing)["redundant"] == {"text": "none", "rows": []}
-    some = page_state(look(waste=replace(STATUS.waste, **{**zeros, "silences": 3}), dropped={"bad\x1b": 2}))[
-        "redundant"
-    ]
+    nothing = replace(STATUS.waste, **{each.name: 0 for each in fields(STATUS.waste)})
+    assert shown(waste=nothing, dropped={"malformed": 0})["redundant"] == {"text": "none", "rows": []}
+    some = shown(waste=replace(nothing, silences=3), dropped={"bad\x1b": 2})["redundant"]
     assert some["text"].startswith("0.0%")
     assert [count for _, count in some["rows"]] == ["3", "2"]
     assert some["rows"][1][0].endswith("bad\\x1b")
@@ -91,24 +87,19 @@ def test_redundant_work_is_one_line_unless_it_is_not_zero():
 
 def test_the_score_before_the_first_evaluation_says_when_it_comes():
     settings = replace(STATUS.settings, evaluate_every=10)
-    (score,) = (
-        each
-        for each in page_state(look(best=None, confirmed=None, settings=settings))["tiles"]
-        if each["name"] == "score"
-    )
+    score = tiles_of(shown(best=None, confirmed=None, settings=settings))["score"]
     assert (score["value"], score["beneath"].split()[-1]) == ("-", "9")
 
 
 def test_episodes_of_a_mean_are_called_as_its_world_calls_them():
-    track = replace(look(evaluating=EpisodeProgress(3, 16)), word="track")
-    document = page_state(track)
+    document = shown(word="track", evaluating=EpisodeProgress(3, 16))
     assert "16 tracks" in document["evaluation"][0]
-    assert "16 tracks" in next(each["beneath"] for each in document["tiles"] if each["name"] == "score")
+    assert "16 tracks" in tiles_of(document)["score"]["beneath"]
 
 
 def test_a_worker_that_left_is_shown_with_its_reason_and_is_not_counted_as_silent():
     gone = replace(STATUS.worker_list[0], state="left", reason="no memory\x1b")
-    document = page_state(look(worker_list=(gone,), workers=WorkerCount(0, 1, 0, 1)))
+    document = shown(worker_list=(gone,), workers=WorkerCount(0, 1, 0, 1))
     assert document["workers"]["reason"] == ["no memory\\x1b"]
     assert "1 left" in document["fleet"]
     assert "silent" not in document["fleet"]

@@ -1,23 +1,17 @@
 """The page's data from journals."""
 
-import shutil
-from pathlib import Path
-
 import pytest
 
 from dreamfleet.common.addons.analysis.elites import RunArchive
 from dreamfleet.common.client.elites import Elite
 from dreamfleet.common.protocol.measures import parse_axes
-from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.addons.dashboard import stored_runs
-
-RUNS = Path(__file__).parents[3] / "fixtures" / "runs"
 
 
 @pytest.fixture
-def run(tmp_path):
-    shutil.copytree(RUNS / "dream", tmp_path / "dream")
-    with open_run(tmp_path, "dream") as stored:
+def run(runs):
+    with RunFolder(runs / "dream") as stored:
         yield stored
 
 
@@ -28,9 +22,8 @@ def test_quartiles_are_those_of_the_candidates_of_every_generation_that_is_drawn
         low, high = found[each.number]
         fitness = sorted(run.fitness(each.number, number) for number in range(run.settings.population))
         assert each.worst <= low <= high <= each.best
-        assert (
-            sum(value <= low for value in fitness) == sum(value >= high for value in fitness) == round(len(fitness) / 4)
-        )
+        below, above = sum(value <= low for value in fitness), sum(value >= high for value in fitness)
+        assert below == above == round(len(fitness) / 4)
 
 
 def test_a_run_whose_candidates_are_too_much_to_read_has_none(run, monkeypatch):

@@ -2,38 +2,37 @@
 
 import asyncio
 import json
+from pathlib import Path
+
+import pytest
 
 from dreamfleet.coordinator.addons.dashboard.view_processes import ViewProcesses, ViewTarget
 
+PLACE = ("--connect", "tcp/127.0.0.1:1")
 
-def ending(views, target):
-    """The last event of a view that shows nothing."""
+
+@pytest.mark.parametrize(("allowed", "target"), [(1, ViewTarget("night", "generation", "3")), (0, ViewTarget("night"))])
+def test_a_view_that_shows_nothing_ends_with_a_notice(tmp_path, allowed, target):
+    views = ViewProcesses(PLACE, tmp_path, allowed)
 
     async def watch():
         said = [each async for each in views.events(target)]
         await views.close()
         return json.loads(said[-1].split(b"data: ")[1])
 
-    return asyncio.run(watch())
-
-
-def test_the_last_notice_is_its_processs_last_message(tmp_path):
-    views = ViewProcesses(("--connect", "tcp/127.0.0.1:1"), tmp_path, 1)
-    notice = ending(views, ViewTarget("night", "generation", "3"))
-    assert (notice["state"], "'night'" in notice["text"]) == ("ended", True), notice
-
-
-def test_where_no_views_are_allowed_none_begins(tmp_path):
-    notice = ending(ViewProcesses(("--connect", "tcp/127.0.0.1:1"), tmp_path, 0), ViewTarget("night"))
+    notice = asyncio.run(watch())
     assert notice["state"] == "ended"
+    assert ("'night'" in notice["text"]) == bool(allowed), "the last message of its process"
 
 
-def test_a_target_becomes_flags_without_injection(tmp_path):
-    place = ("--connect", "tcp/a:1", "tcp/b:2")
-    for asked, flags in (
-        ({"run": "night"}, ["--run=night", *place]),
-        ({"run": "night", "best": ""}, ["--run=night", *place, "--best"]),
-        ({"run": "night", "worker": "a/0a1b2c3d"}, ["--run=night", *place, "--worker=a/0a1b2c3d"]),
-        ({"run": "night", "generation": "7"}, ["--controller=night", "--generation=7", f"--runs-dir={tmp_path}"]),
-    ):
-        assert ViewTarget.of(asked).flags(place, tmp_path) == flags
+@pytest.mark.parametrize(
+    ("asked", "flags"),
+    [
+        ({"run": "night"}, ["--run=night", *PLACE]),
+        ({"run": "night", "best": ""}, ["--run=night", *PLACE, "--best"]),
+        ({"run": "night", "worker": "a/0a1b2c3d"}, ["--run=night", *PLACE, "--worker=a/0a1b2c3d"]),
+        ({"run": "night", "generation": "7"}, ["--controller=night", "--generation=7", "--runs-dir=runs"]),
+    ],
+)
+def test_a_target_becomes_flags_without_injection(asked, flags):
+    assert ViewTarget.of(asked).flags(PLACE, Path("runs")) == flags

@@ -1,9 +1,8 @@
 """Prometheus's own parser on the exposition of a status."""
 
-import dataclasses
 import json
 import re
-from pathlib import Path
+from dataclasses import replace
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
@@ -12,14 +11,15 @@ from dreamfleet.common.client.status import Throughput
 from dreamfleet.common.protocol.host_classes import MAX_LISTED, HostClasses
 from dreamfleet.common.runs.records import StoredConfirmation, StoredEvaluation
 from dreamfleet.coordinator.addons.metrics.prometheus import MAX_REASONS, MAX_WORKERS, exposition
+from tests.support.processes import ROOT
 from tests.support.samples import STATUS
 
-GRAFANA = Path(__file__).parents[4] / "deploy" / "grafana" / "dreamfleet.json"
-WORKER = dataclasses.replace(STATUS.worker_list[0], job_seconds=1.5, round_trip=0.02, resent=3)
-WHOLE = dataclasses.replace(
+GRAFANA = ROOT / "deploy" / "grafana" / "dreamfleet.json"
+WORKER = replace(STATUS.worker_list[0], job_seconds=1.5, round_trip=0.02, resent=3)
+WHOLE = replace(
     STATUS, worker_list=(WORKER,), limits={"minutes": 30.0}, throughput=Throughput(987.5, 448000, 60.0),
     confirmed=StoredConfirmation(4, 16, 118.5, 30.0, 7),
-    generation=dataclasses.replace(STATUS.generation, temperature=1.25), classes=HostClasses.of({("a" * 16, "x"): 5}),
+    generation=replace(STATUS.generation, temperature=1.25), classes=HostClasses.of({("a" * 16, "x"): 5}),
 )  # fmt: skip
 HOSTILE = 'a"b\\c\nd{run="x"} 1\x1b[2J\ud800'
 
@@ -45,36 +45,36 @@ def test_values_are_the_statuss():
 
 
 def test_unknown_values_have_no_sample():
-    found = read(dataclasses.replace(STATUS, last=None, recent=(), evaluation=None, best=None))
+    found = read(replace(STATUS, last=None, recent=(), evaluation=None, best=None))
     for name in ("fitness", "evaluated_score", "confirmed_score", "temperature", "eta_seconds", "worker_job_seconds"):
         assert f"dreamfleet_{name}" not in found
 
 
 def test_a_score_of_one_episode_has_no_sample_of_its_error():
-    found = read(dataclasses.replace(STATUS, best=StoredEvaluation(4, 1, 120.5, 0.0)))
+    found = read(replace(STATUS, best=StoredEvaluation(4, 1, 120.5, 0.0)))
     assert found["dreamfleet_best_evaluated_score"][0][1] == 120.5
     assert "dreamfleet_best_evaluated_score_error" not in found
     assert found["dreamfleet_evaluated_score_error"][0][1] == STATUS.evaluation.error
 
 
 def test_results_by_host_class_sum_to_the_total():
-    found = read(dataclasses.replace(STATUS, classes=HostClasses.of({(f"{n:016x}", "x"): 10 - n for n in range(9)})))
+    found = read(replace(STATUS, classes=HostClasses.of({(f"{n:016x}", "x"): 10 - n for n in range(9)})))
     assert found["dreamfleet_host_classes"][0][1] == 9
     results = {labels["class"]: value for labels, value in found["dreamfleet_class_results"]}
     assert results == {**{f"{n:016x}": 10 - n for n in range(MAX_LISTED)}, "other": 6 + 5 + 4 + 3 + 2}
 
 
 def test_label_sets_are_bounded():
-    fleet = [dataclasses.replace(WORKER, worker=f"host-{number}/0a1b2c3d") for number in range(500)]
+    fleet = [replace(WORKER, worker=f"host-{number}/0a1b2c3d") for number in range(500)]
     dropped = {f"reason {number}": 1 for number in range(500)}
-    found = read(dataclasses.replace(WHOLE, worker_list=tuple(fleet), dropped=dropped))
+    found = read(replace(WHOLE, worker_list=tuple(fleet), dropped=dropped))
     assert len(found["dreamfleet_worker_slots"]) == MAX_WORKERS
     assert len(found["dreamfleet_dropped_messages_total"]) == MAX_REASONS
 
 
 def test_untrusted_text_cannot_start_a_line():
-    worker = dataclasses.replace(WORKER, worker=HOSTILE)
-    hostile = dataclasses.replace(WHOLE, run=HOSTILE, worker_list=(worker,), dropped={HOSTILE: 1})
+    worker = replace(WORKER, worker=HOSTILE)
+    hostile = replace(WHOLE, run=HOSTILE, worker_list=(worker,), dropped={HOSTILE: 1})
     found, plain = read(hostile), read(WHOLE)
     assert found.keys() == plain.keys()
     assert {name: len(samples) for name, samples in found.items()} == {name: len(each) for name, each in plain.items()}
@@ -82,8 +82,7 @@ def test_untrusted_text_cannot_start_a_line():
 
 @pytest.mark.parametrize("value", [float("inf"), float("nan"), 1.7e308])
 def test_any_number_can_be_written(value):
-    last = dataclasses.replace(STATUS.last, mean=value)
-    assert len(read(dataclasses.replace(WHOLE, last=last))["dreamfleet_fitness"]) == 3
+    assert len(read(replace(WHOLE, last=replace(STATUS.last, mean=value)))["dreamfleet_fitness"]) == 3
 
 
 def test_every_metric_of_the_grafana_dashboard_exists():
@@ -97,7 +96,7 @@ def test_every_metric_of_the_grafana_dashboard_exists():
 
 
 def test_several_runs_share_each_metrics_head():
-    text = exposition(WHOLE, dataclasses.replace(WHOLE, run="lucid", confirmed=None)).decode()
+    text = exposition(WHOLE, replace(WHOLE, run="lucid", confirmed=None)).decode()
     heads = re.findall(r"^# TYPE (\S+)", text, re.MULTILINE)
     assert len(heads) == len(set(heads))
     families = {each.name: each for each in text_string_to_metric_families(text)}

@@ -2,10 +2,8 @@
 Tests sinks.py, coordinator/settings/live_log.py and common/files/tensorboard.py."""
 
 import json
-import sqlite3
 import sys
 from collections import Counter
-from contextlib import closing
 from multiprocessing import active_children
 
 import pytest
@@ -21,11 +19,16 @@ from dreamfleet.coordinator.addons.sinks.sinks import check_sinks
 from dreamfleet.coordinator.settings.live_log import SinkName, parse_sink
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from tests.support.events import scalars
+from tests.support.journals import change_journal
 from tests.support.processes import ROOT
 
-RUN = "dream"
 EXAMPLES = ROOT / "docs" / "how-to"
 BOARD = SinkName("tensorboard", "")
+
+
+@pytest.fixture
+def run(runs):
+    return runs / "dream"
 
 
 def wanted(run):
@@ -51,83 +54,71 @@ def write(run, name=BOARD, looks=1, between=lambda look: None):
     return said
 
 
-def delete_from(run, generation):
-    with closing(sqlite3.connect(run / "journal.sqlite")) as journal, journal:
-        journal.execute("UPDATE generation SET closed = NULL WHERE number >= ?", (generation,))
+def test_a_record_has_every_point_once(run):
+    assert write(run, looks=3) == []
+    assert drawn(run / "tensorboard") == wanted(run)
+    assert max(wanted(run).values()) == 1
 
 
-def test_a_record_has_every_point_once(runs):
-    assert write(runs / RUN, looks=3) == []
-    assert drawn(runs / RUN / "tensorboard") == wanted(runs / RUN)
-    assert max(drawn(runs / RUN / "tensorboard").values()) == 1
+def test_another_run_of_the_same_name_keeps_its_record(run, tmp_path):
+    name, board = SinkName("tensorboard", str(tmp_path / "board")), tmp_path / "board" / run.name
+    assert write(run, name) == []
+    before = drawn(board)
+    change_journal(run, "UPDATE run SET value = 'another' WHERE key = 'uid'")
+    (said,) = write(run, name)
+    assert str(board) in said
+    assert drawn(board) == before
 
 
-def test_another_run_of_the_same_name_keeps_its_record(runs, tmp_path):
-    name = SinkName("tensorboard", str(tmp_path / "board"))
-    assert write(runs / RUN, name) == []
-    before = drawn(tmp_path / "board" / RUN)
-    with closing(sqlite3.connect(runs / RUN / "journal.sqlite")) as journal, journal:
-        journal.execute("UPDATE run SET value = 'another' WHERE key = 'uid'")
-    (said,) = write(runs / RUN, name)
-    assert str(tmp_path / "board" / RUN) in said
-    assert drawn(tmp_path / "board" / RUN) == before
-
-
-def test_a_process_that_was_killed_holds_up_no_end(runs, caplog):
-    with live_log(runs / RUN, ("tensorboard",)):
+def test_a_process_that_was_killed_holds_up_no_end(run):
+    with live_log(run, ("tensorboard",)):
         (child,) = active_children()
         child.kill()
         child.join()
     assert not active_children()
 
 
-def test_a_record_goes_on_where_it_was_left(runs, tmp_path):
-    name = SinkName("tensorboard", str(tmp_path / "board"))
-    whole = wanted(runs / RUN)
-    with closing(sqlite3.connect(runs / RUN / "journal.sqlite")) as journal, journal:
-        (times,) = [dict(journal.execute("SELECT number, closed FROM generation"))]
-    delete_from(runs / RUN, 2)
-    write(runs / RUN, name)
-    (first,) = (tmp_path / "board" / RUN).glob(EVENTS)
+def test_a_record_goes_on_where_it_was_left(run):
+    board, whole = run / "tensorboard", wanted(run)
+    times = change_journal(run, "SELECT closed, number FROM generation")
+    change_journal(run, "UPDATE generation SET closed = NULL WHERE number >= 2")
+    write(run)
+    (first,) = board.glob(EVENTS)
     first.write_bytes(first.read_bytes()[:-5])  # a kill tore the last record
-    with closing(sqlite3.connect(runs / RUN / "journal.sqlite")) as journal, journal:
-        journal.executemany("UPDATE generation SET closed = ? WHERE number = ?", [(at, n) for n, at in times.items()])
-    write(runs / RUN, name)
-    write(runs / RUN, name)
-    found = read_scalars(tmp_path / "board" / RUN)
-    assert Counter((each, step) for each, points in found.items() for step in points) == whole
-    assert sum(len(path.read_bytes()) > 0 for path in (tmp_path / "board" / RUN).glob(EVENTS)) == 3
+    for closed_and_number in times:
+        change_journal(run, "UPDATE generation SET closed = ? WHERE number = ?", *closed_and_number)
+    for _ in range(2):
+        write(run)
+    assert Counter((name, step) for name, points in read_scalars(board).items() for step in points) == whole
+    assert sum(len(path.read_bytes()) > 0 for path in board.glob(EVENTS)) == 3
 
 
-def test_results_that_were_taken_back_are_replaced(runs):
-    folder = runs / RUN / "tensorboard"
-    write(runs / RUN)
-    before = read_scalars(folder)
-    with closing(sqlite3.connect(runs / RUN / "journal.sqlite")) as journal, journal:
-        journal.execute("UPDATE generation SET mean = mean + 100 WHERE number = 1")
-    write(runs / RUN)
-    found = read_scalars(folder)
+def test_results_that_were_taken_back_are_replaced(run):
+    write(run)
+    before = read_scalars(run / "tensorboard")
+    change_journal(run, "UPDATE generation SET mean = mean + 100 WHERE number = 1")
+    write(run)
+    found = read_scalars(run / "tensorboard")
     assert found["fitness/mean"][1] == pytest.approx(before["fitness/mean"][1] + 100)
     assert {name: len(points) for name, points in found.items()} == {name: len(each) for name, each in before.items()}
 
 
-def test_points_of_generations_that_were_dropped_are_taken_back(runs):
-    folder = runs / RUN / "tensorboard"
-    write(runs / RUN)
-    delete_from(runs / RUN, 1)
-    with closing(sqlite3.connect(runs / RUN / "journal.sqlite")) as journal, journal:
-        journal.execute("DELETE FROM evaluation WHERE generation >= 1")
-        journal.execute("DELETE FROM run WHERE key = 'confirmed'")
-    write(runs / RUN)
-    assert {(name, step) for name, points in read_scalars(folder).items() for step in points} == set(wanted(runs / RUN))
+def test_points_of_generations_that_were_dropped_are_taken_back(run):
+    write(run)
+    change_journal(run, "UPDATE generation SET closed = NULL WHERE number >= 1")
+    change_journal(run, "DELETE FROM evaluation WHERE generation >= 1")
+    change_journal(run, "DELETE FROM run WHERE key = 'confirmed'")
+    write(run)
+    found = read_scalars(run / "tensorboard")
+    assert {(name, step) for name, points in found.items() for step in points} == set(wanted(run))
 
 
-def test_a_record_that_cannot_be_written_is_reported_once_and_whole_later(runs):
-    obstacle = runs / RUN / "tensorboard"
+def test_a_record_that_cannot_be_written_is_reported_once_and_whole_later(run):
+    obstacle = run / "tensorboard"
     obstacle.write_text("a file where the folder should be")
-    said = write(runs / RUN, looks=4, between=lambda look: obstacle.unlink() if look == 4 else None)
+    said = write(run, looks=4, between=lambda look: obstacle.unlink() if look == 4 else None)
     assert [str(obstacle) in text for text in said] == [True, False]
-    assert drawn(obstacle) == wanted(runs / RUN)
+    assert drawn(obstacle) == wanted(run)
 
 
 def test_a_name_has_a_kind_and_perhaps_a_place():
@@ -173,13 +164,13 @@ class Half:
 """
 
 
-def test_a_sink_of_ones_own_has_every_point(runs, tmp_path, own_sink, monkeypatch):
+def test_a_sink_of_ones_own_has_every_point(run, tmp_path, own_sink, monkeypatch):
     monkeypatch.setenv("DREAMFLEET_TRUST", "own_sink")
     name = f"own_sink:Board:{tmp_path / 'board'}"
     check_sinks([name])
-    with live_log(runs / RUN, [name]):
+    with live_log(run, [name]):
         pass
-    assert drawn(tmp_path / "board" / RUN) == wanted(runs / RUN)
+    assert drawn(tmp_path / "board" / run.name) == wanted(run)
 
 
 @pytest.mark.parametrize("kind", ["own_sink:Half", "own_sink:Absent", "own_absent:Sink"])
@@ -189,15 +180,13 @@ def test_a_sink_that_cannot_be_is_a_users_error(own_sink, monkeypatch, kind):
         check_sinks((kind,))
 
 
-def test_a_runs_folder_chooses_no_module_and_its_user_does(runs, own_sink, monkeypatch, capsys):
-    with closing(sqlite3.connect(runs / RUN / "journal.sqlite")) as journal, journal:
-        journal.execute("REPLACE INTO run VALUES ('network', ?)", (json.dumps({"log_to": ["own_sink:Half"]}),))
-    words = ["coordinator", "--resume", RUN, "--runs-dir", str(runs)]
-    assert main(words) == 2
+def test_a_runs_folder_chooses_no_module_and_its_user_does(run, own_sink, monkeypatch, capsys):
+    change_journal(run, "REPLACE INTO run VALUES ('network', ?)", json.dumps({"log_to": ["own_sink:Half"]}))
+    assert main(["coordinator", "--resume", run.name]) == 2
     assert "--trust own_sink" in capsys.readouterr().err
     assert not (own_sink / "imported").exists()
     monkeypatch.setenv("DREAMFLEET_NETWORK_LOG_TO", "own_sink:Half")
-    assert main(words) == 2
+    assert main(["coordinator", "--resume", run.name]) == 2
     assert (own_sink / "imported").exists()
 
 
@@ -207,5 +196,5 @@ def test_an_example_without_its_package_ends_the_coordinator_before_its_run(kind
     monkeypatch.setenv("DREAMFLEET_TRUST", "")
     monkeypatch.setenv("DREAMFLEET_NETWORK_LOG_TO", f"{kind}_sink:{kind.capitalize()}Sink")
     with hidden(kind):
-        assert main(["coordinator", "--runs-dir", str(tmp_path / "runs")]) == 2
+        assert main(["coordinator"]) == 2
     assert not (tmp_path / "runs" / "run").exists()

@@ -77,9 +77,8 @@ def test_an_environment_without_its_python_is_not_listed(tmp_path, there):
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["killed", "full"])
 def test_an_agent_that_ends_at_any_step_leaves_what_the_next_one_removes(tmp_path, mode):
-    script = ROOT / "tests" / "support" / "agent_steps.py"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, script, tmp_path, mode], capture_output=True, check=True, env=environment)
+    words = [sys.executable, ROOT / "tests" / "support" / "agent_steps.py", tmp_path, mode]
+    done = subprocess.run(words, capture_output=True, check=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
     found = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(found) > 15
     assert {each["code"] for each in found[:-1]} == {9 if mode == "killed" else 8}
