@@ -15,8 +15,7 @@ from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
 from dreamfleet.coordinator.addons.runs.stored_run import open_run
 from dreamfleet.experiments.started_run import RunPausedError, _claim, _free_name, check_settings, evolve, start_run
-from tests.support.access import until
-from tests.support.processes import DEADLINE, ROOT, environment
+from tests.support.processes import DEADLINE, ROOT, environment, until
 from tests.support.tasks import RAISING
 
 SMALL = {"task": "gym:CartPole-v1", "population": 4, "episodes": 2, "evaluate_every": 0, "workers": 1}
