@@ -1,6 +1,6 @@
-"""A run whose means are evaluated: its jobs are finished in any order, and its coordinator is killed anywhere."""
+"""A run whose means are evaluated, and whose jobs are finished in any order."""
 
-from dreamfleet.common.protocol.messages import Result, ResultBatch
+from dreamfleet.common.protocol.messages import Result
 from tests.support.run_bench import Bench
 
 EVERY = 2  # generations from one evaluation to the next
@@ -42,18 +42,3 @@ class Evaluated(Bench):
             self.finish(choose(self))
             after()
         return found
-
-    def die_by(self, chance):
-        """Before the commit of a result, after it, or not."""
-
-        def deliver(name, result):
-            fate = chance.random()
-            batch = ResultBatch(run_uid=self.run.uid, incarnation=1, fingerprint="f", results=(result,))
-            self.worker_protocol.handle_results(name, batch, self.now)
-            self.run.advance(self.now)
-            if fate > 0.2 or self.run.state.ended is not None:
-                self.run.commit()
-            if fate < 0.4 and self.run.state.ended is None:
-                self.restart()
-
-        self.deliver = deliver

@@ -29,10 +29,8 @@ class Controlled(Bench):
 
 
 @pytest.fixture
-def bench(tmp_path, random_bundle):
-    made = Controlled(tmp_path / "night", random_bundle.path)
-    yield made
-    made.journal.close()
+def bench(make_bench):
+    return make_bench(Controlled)
 
 
 def test_a_known_verb_is_obeyed_and_one_that_ends_the_coordinator_names_the_command_that_continues(bench):

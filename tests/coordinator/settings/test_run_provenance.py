@@ -45,18 +45,10 @@ class Spending(Reporting):
 
 
 @pytest.fixture
-def make(tmp_path, random_bundle):
-    made = []
-
-    def begin(start=None, **changes):
-        kind = type("One", (Spending,), {"start": start})
-        settings = replace(EVALUATED, **changes)
-        made.append(kind(tmp_path / "runs" / f"night-{len(made)}", random_bundle.path, settings, 4))
-        return made[-1]
-
-    yield begin
-    for each in made:
-        each.journal.close()
+def make(make_bench):
+    return lambda start=None, **changes: make_bench(
+        type("One", (Spending,), {"start": start}), replace(EVALUATED, **changes), 4
+    )
 
 
 def test_it_holds_generations_effort_fingerprint_versions_and_seeds(make):
@@ -72,11 +64,13 @@ def test_it_holds_generations_effort_fingerprint_versions_and_seeds(make):
     assert read_run_settings(bench.saved()) == settings
 
 
-def test_effort_is_counted_on_as_it_would_be_summed_up(make):
+def test_effort_is_counted_on_once_a_result_as_it_would_be_summed_up(make):
     bench = make()
     before = bench.journal.results.effort
+    bench.given += [work.job for send in bench.run.fleet.dispatch(bench.now) for work in send.work]
+    job = bench.given[0]
     bench.step()
-    bench.run.commit()
+    bench.answer(Result(job.digest, 1.0, 10, 0.1, None, None))
     assert bench.journal.results.effort == before + Effort(10, 0, 0, 100_000)
     again = Journal(bench.path / "journal.sqlite")
     assert again.results.effort == bench.journal.results.effort
@@ -128,20 +122,6 @@ def test_another_run_is_not_gone_on_with_and_another_version_is_named(tmp_path, 
         strange.plan(tmp_path / "new")
 
 
-@pytest.mark.slow
-def test_a_run_is_neither_compared_with_itself_nor_with_one_that_began_elsewhere(make):
-    first = make()
-    again = Rerun.of(first.end(), None)
-    with pytest.raises(UsageError, match=f"{first.path.name} .*--run"):
-        again.plan(first.path)
-    same = make()
-    assert again.plan(same.path)[0] is None
-    size = first.settings.controller.size
-    other = make(StartPoint(np.ones(size), first.settings.task.bundle, "elsewhere"))
-    with pytest.raises(UsageError, match=f"{other.path.name} .*--run"):
-        again.plan(other.path)
-
-
 def begun(bundle, **changes):
     """A controller of a run that has just begun."""
     settings = freeze(RunConfig(**changes), bundle)
@@ -166,11 +146,15 @@ def test_no_file_chooses_what_is_imported(random_bundle, tmp_path):
 
 
 @pytest.mark.slow
-def test_why_a_second_time_differs_is_said_as_far_as_it_is_known(make):
+def test_a_run_is_compared_with_another_that_began_alike_and_why_they_differ_is_said_as_far_as_it_is_known(make):
     first, second = make(), make(seed=2)
-    controller = first.end()
+    again = Rerun.of(first.end(), None)
     second.end()
-    again = Rerun.of(controller, None)
+    elsewhere = StartPoint(np.ones(first.settings.controller.size), first.settings.task.bundle, "elsewhere")
+    for other in (first, make(elsewhere)):
+        with pytest.raises(UsageError, match=f"{other.path.name} .*--run"):
+            again.plan(other.path)
+    assert again.plan(make().path)[0] is None
     assert again.compare(first.path).same
     found = again.compare(second.path)
     assert not found.same
@@ -194,14 +178,3 @@ def test_whether_hosts_of_the_second_time_are_of_the_first_ones_class_is_said(ma
     assert again.compare(first.path).same
     for each in ("a", "b"):
         assert each * 16 in again.compare(second.path).summary
-
-
-def test_a_result_is_counted_once_when_it_is_repeated(make):
-    bench = make()
-    for send in bench.run.fleet.dispatch(bench.now):
-        bench.given += [work.job for work in send.work]
-    job = bench.given.pop(0)
-    before = bench.journal.results.effort
-    for _ in range(2):
-        bench.deliver("a/00000001", Result(job.digest, 1.0, 10, 0.1, None, None))
-    assert bench.journal.results.effort == before + Effort(10, 0, 0, 100_000)

@@ -8,8 +8,8 @@ from dreamfleet.common.artifacts.actions import one_hot
 from dreamfleet.common.artifacts.bundle_store import shipped_names
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts, WorldFacts
-from dreamfleet.common.errors import ControllerError, UsageError
-from dreamfleet.common.protocol.messages import OWN_END_VERSION, TaskSpec
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.protocol.messages import OWN_END_VERSION
 from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.common.worlds import shipped
 from dreamfleet.coordinator.service.main import RunRequest, _resolve_settings
@@ -18,7 +18,6 @@ from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.settings.presets import find_preset
-from dreamfleet.coordinator.settings.start import StartPoint
 from dreamfleet.experiments.demo import DemoConfig
 from tests.support.bundles import write_world_bundle
 from tests.support.dreams import ABOUT, DRAWN, MODELS, VAE, WORLDS, write_bundle_of
@@ -76,23 +75,19 @@ def test_a_world_model_of_another_world_is_refused(bundle, random_bundle, task):
             settings_of(each, task=task)
 
 
-@pytest.mark.parametrize("preset", ["takecover", "real"])
-def test_a_preset_that_was_made_for_another_worlds_model_is_refused(bundle, preset):
-    with pytest.raises(UsageError, match=f"{preset} .*b.zip .*{ABSENT}.*--preset"):
-        freeze(
-            RunConfig(**{**find_preset(preset), "bundle": str(bundle.path), "subspace": None}, preset=preset), bundle
-        )
+def preset_for(preset, bundle):
+    changes = {"bundle": str(bundle.path), "subspace": None, "preset": preset}
+    return freeze(RunConfig(**find_preset(preset) | changes), bundle)
 
 
-@pytest.mark.parametrize("preset", ["pixels", "dream"])
-def test_a_preset_without_a_world_model_is_of_any_world(bundle, preset):
-    assert settings_of(bundle, **find_preset(preset), preset=preset).task.task == "dream"
-
-
-def test_a_preset_fits_a_world_model_of_its_world_that_does_not_ship(tmp_path):
-    own = write_bundle_of("choices", tmp_path / "b.zip", task="takecover")
-    named = {**find_preset("takecover"), "bundle": str(own.path)}
-    assert freeze(RunConfig(**named, preset="takecover"), own).task.horizon == 525
+def test_a_preset_fits_world_models_of_its_world_and_one_without_a_world_model_any(bundle, tmp_path):
+    for preset in ("takecover", "real"):
+        with pytest.raises(UsageError, match=f"{preset} .*b.zip .*{ABSENT}.*--preset"):
+            preset_for(preset, bundle)
+    for preset in ("pixels", "dream"):
+        assert preset_for(preset, bundle).task.task == "dream"
+    own = write_bundle_of("choices", tmp_path / "own.zip", task="takecover")
+    assert preset_for("takecover", own).task.horizon == 525, "though it does not ship"
 
 
 def test_a_gymnasium_environment_is_scored_with_a_world_model_of_its_own(tmp_path):
@@ -133,16 +128,6 @@ def test_a_dream_of_the_first_world_may_have_an_end_too(random_bundle):
     assert settings_of(random_bundle, task="dream", end="drawn").task.version == 1 + OWN_END_VERSION
 
 
-def test_a_start_that_drives_otherwise_is_refused_in_any_world(bundle):
-    settings = settings_of(bundle, task="dream", variant=("decide_every=4",))
-    shape = settings.controller
-    held = StartPoint([0.0] * shape.size, bundle.sha256, "run night", '{"decide_every": 4}')
-    held.check(settings, bundle)
-    assert held.apply_to(RunConfig(bundle=str(bundle.path))).variant == ("decide_every=4",)
-    with pytest.raises(ControllerError, match=r"decide_every.*--variant"):
-        held.check(settings_of(bundle, task="dream"), bundle)
-
-
 @pytest.mark.parametrize("name", ["takecover", "takecover-real", "pixels"])
 def test_presets_of_other_worlds_begin_on_their_bundles(tmp_path, name):
     facts = WorldFacts.of(one_hot(3), reward=RewardFacts("survival", gain=4.0), end=EndRule("drawn"), **ABOUT)
@@ -166,7 +151,3 @@ def test_each_demonstration_has_a_world_model_that_ships():
     assert {DemoConfig(world=each).plan.bundle for each in shipped.WORLDS} <= set(shipped_names())
     with pytest.raises(UsageError, match=r"--world .*car-racing, takecover.*'moon'"):
         DemoConfig(world="moon")
-
-
-def test_the_words_of_an_earlier_specification_stand():
-    assert to_plain(TaskSpec("dream", "", 10, 0)).keys() == {"task", "bundle", "horizon", "patience"}
