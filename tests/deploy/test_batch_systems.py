@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.support import tasks
-from tests.support.processes import DEADLINE, environment
+from tests.support.processes import DEADLINE, environment, until
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 BIN = Path(sys.executable).parent
@@ -46,15 +46,8 @@ def start(processes):
         yield begin
 
 
-def wait_until(true):
-    deadline = time.monotonic() + DEADLINE
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-
-
-def slots(processes):
-    return processes.statuses()[0].slots
+def await_slots(processes, count):
+    until(lambda: processes.statuses()[0].slots == count, f"no {count} slots")
 
 
 def drained(begun):
@@ -75,10 +68,10 @@ def test_slurm_starts_a_worker_that_drains_before_its_limit(processes, coordinat
     variables = {"SLURM_CPUS_PER_TASK": "2", "SLURM_ARRAY_TASK_ID": "7", "SLURMD_NODENAME": "node3"}
     begun = start(DEPLOY / "slurm" / "workers.sh", *worker_words(processes), **variables)
     coordinator.wait_for_event("generation", number=1)
-    assert slots(processes) == 2
+    await_slots(processes, 2)
     assert processes.statuses()[0].worker_list[0].worker.startswith("node3-7/")
     drained(begun)
-    wait_until(lambda: slots(processes) == 0)
+    await_slots(processes, 0)
     near = {"SLURM_JOB_END_TIME": str(int(time.time()) + 95)}
     assert start(DEPLOY / "slurm" / "workers.sh", *worker_words(processes), **variables, **near).wait(DEADLINE) == 0
 
@@ -90,12 +83,12 @@ def test_dask_has_a_worker_beside_each_of_its_own(processes, coordinator, start,
     with LocalCluster(n_workers=1, threads_per_worker=2, processes=True, dashboard_address=":0") as cluster:
         begun = start(sys.executable, DEPLOY / "dask" / "workers.py", cluster.scheduler_address,
                       *worker_words(processes))  # fmt: skip
-        wait_until(lambda: slots(processes) == 2)
+        await_slots(processes, 2)
         cluster.scale(2)
-        wait_until(lambda: slots(processes) == 4)
+        await_slots(processes, 4)
         coordinator.wait_for_event("generation")
         assert "draining" in drained(begun)
-        wait_until(lambda: slots(processes) == 0)
+        await_slots(processes, 0)
 
 
 @pytest.mark.long
@@ -106,11 +99,11 @@ def test_ray_has_a_worker_on_each_node(processes, coordinator, start, cluster_en
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
     try:
         begun = start(sys.executable, DEPLOY / "ray" / "workers.py", cluster.address, *worker_words(processes))
-        wait_until(lambda: slots(processes) == 1)
+        await_slots(processes, 1)
         cluster.add_node(num_cpus=2)
-        wait_until(lambda: slots(processes) == 3)
+        await_slots(processes, 3)
         coordinator.wait_for_event("generation")
         assert "draining" in drained(begun)
-        wait_until(lambda: slots(processes) == 0)
+        await_slots(processes, 0)
     finally:
         cluster.shutdown()

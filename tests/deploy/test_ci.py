@@ -60,19 +60,11 @@ def run(*names):
     return [(part.failed, part.unstable) for part in parts]
 
 
-def test_a_test_that_failed_by_chance_is_unstable_and_does_not_fail_the_run(project):
-    project(chance=1)
-    assert run("test", "slow") == [([], ["test_it.py::test_by_chance[0]"]), ([], [])]
-
-
-def test_what_failed_twice_fails_the_run(project):
-    project(chance=1, wrong=1)
-    assert run("test") == [(["test_it.py::test_wrong[0]"], ["test_it.py::test_by_chance[0]"])]
-
-
-def test_an_exact_test_never_runs_again(project):
-    project(exact=1)
-    assert run("test") == [(["test_it.py::test_bits[0]"], [])]
+def test_what_failed_by_chance_is_unstable_and_what_failed_twice_or_is_exact_fails_the_run(project):
+    project(chance=1, wrong=1, exact=1)
+    assert run("test") == [
+        (["test_it.py::test_bits[0]", "test_it.py::test_wrong[0]"], ["test_it.py::test_by_chance[0]"])
+    ]
 
 
 def test_of_more_than_three_none_runs_again(project):
@@ -82,15 +74,10 @@ def test_of_more_than_three_none_runs_again(project):
     assert not unstable
 
 
-def test_a_module_that_cannot_be_imported_fails_the_run(project):
+def test_a_module_that_cannot_be_imported_and_a_part_that_is_no_test_fail_by_their_names(project):
     project()
     Path("test_broken.py").write_text("import no_such_module\n")
-    assert run("test") == [(["test_broken.py"], [])]
-
-
-def test_a_part_that_is_no_test_fails_by_its_name(project):
-    project()
-    assert run("check", "broken") == [([], []), (["make broken"], [])]
+    assert run("check", "broken", "test") == [([], []), (["make broken"], []), (["test_broken.py"], [])]
 
 
 @pytest.mark.parametrize(("wrong", "code"), [(0, 0), (1, 1)])

@@ -37,8 +37,8 @@ def checked(*words, **more):
     return done.stdout + done.stderr
 
 
-def documents(path):
-    return list(yaml.safe_load_all(path.read_text()))
+def document(*place):
+    return yaml.safe_load(DEPLOY.joinpath(*place).read_text())
 
 
 def understood(verb, words):
@@ -54,7 +54,7 @@ def test_the_linters_are_content():
 
 
 def test_compose_starts_what_our_verbs_know():
-    (compose,) = documents(DEPLOY / "compose.yaml")
+    compose = document("compose.yaml")
     services = compose["services"]
     understood("coordinator", ["--run", *services["coordinator"]["command"]])
     understood("worker", services["worker"]["command"])
@@ -68,20 +68,18 @@ def test_compose_starts_what_our_verbs_know():
 
 def test_the_cluster_takes_what_the_kustomization_lists():
     folder = DEPLOY / "kubernetes"
-    (whole,) = documents(folder / "kustomization.yaml")
-    listed = [document for name in whole["resources"] for document in documents(folder / name)]
+    whole = document("kubernetes", "kustomization.yaml")
+    listed = [each for name in whole["resources"] for each in yaml.safe_load_all((folder / name).read_text())]
     assert {*whole["resources"], "kustomization.yaml"} == {path.name for path in folder.iterdir()}
     secrets = {each["name"] for each in whole["secretGenerator"]}
-    for document in (each for each in listed if each["kind"] != "ScaledObject"):
-        kubernetes_validate.validate(document, KUBERNETES, strict=True)
+    for each in (each for each in listed if each["kind"] != "ScaledObject"):
+        kubernetes_validate.validate(each, KUBERNETES, strict=True)
     for kind, verb, first in (("Job", "coordinator", ["--run"]), ("Deployment", "worker", [])):
         (pod,) = (each["spec"]["template"]["spec"] for each in listed if each["kind"] == kind)
         (container,) = pod["containers"]
         understood(verb, [*first, *container["args"]])
         assert {each["name"] for each in whole["images"]} >= {container["image"]}
-        mounted = {each["name"] for each in container["volumeMounts"]}
-        offered = {each["name"] for each in pod["volumes"]}
-        assert mounted == offered
+        assert {each["name"] for each in container["volumeMounts"]} == {each["name"] for each in pod["volumes"]}
         assert {each["secret"]["secretName"] for each in pod["volumes"] if "secret" in each} <= secrets
         ports = {each["name"] for each in container.get("ports", ())}
         probes = [each for name, each in container.items() if name.endswith("Probe") and "exec" not in each]
@@ -97,7 +95,7 @@ def test_the_cluster_takes_what_the_kustomization_lists():
 
 
 def test_workers_are_scaled_by_metrics_that_are_there():
-    (scaled,) = documents(DEPLOY / "kubernetes" / "autoscaling.yaml")
+    scaled = document("kubernetes", "autoscaling.yaml")
     found = keda.ScaledObject.model_validate(scaled)
     assert found.model_dump(by_alias=True, exclude_unset=True, mode="json") == scaled  # nothing that it does not know
     query = scaled["spec"]["triggers"][0]["metadata"]["query"]
@@ -124,13 +122,13 @@ def test_systemd_takes_the_units_and_finds_them_shut(unit, tmp_path):
 
 
 def test_the_spot_machine_runs_the_unit():
-    (document,) = documents(DEPLOY / "cloud-init" / "worker.yaml")
-    written = {each["path"]: each for each in document["write_files"]}
+    machine = document("cloud-init", "worker.yaml")
+    written = {each["path"]: each for each in machine["write_files"]}
     unit = written["/etc/systemd/system/dreamfleet-worker.service"]["content"]
     own = (DEPLOY / "systemd" / "dreamfleet-worker.service").read_text()
     assert unit == own[own.index("[Unit]") :]
     assert written["/etc/dreamfleet/worker.join"]["permissions"] == "0600"
-    for words in document["runcmd"]:
+    for words in machine["runcmd"]:
         if words[0].endswith("/dreamfleet"):
             understood(words[1], words[2:])
 

@@ -13,22 +13,15 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
-@pytest.fixture(scope="module")
-def shipped(tmp_path_factory):
-    """The pages and what else lies in `docs/` and `deploy/` of a wheel."""
-    folder = tmp_path_factory.mktemp("wheel")
+def test_each_link_of_a_page_that_ships_leads_to_what_ships(tmp_path):
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     for pattern in project["tool"]["setuptools"]["package-data"]["dreamfleet"]:
         for path in ROOT.glob(pattern):
-            target = folder / path.relative_to(ROOT)
+            target = tmp_path / path.relative_to(ROOT)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, target)
-    return folder
-
-
-def test_each_link_of_a_page_that_ships_leads_to_what_ships(shipped):
-    assert len(list(shipped.rglob("*.md"))) > 50
-    assert dead_links(shipped) == []
+    assert len(list(tmp_path.rglob("*.md"))) > 50
+    assert dead_links(tmp_path) == []
 
 
 def test_a_dead_link_is_found_and_a_live_or_foreign_one_is_not(tmp_path):

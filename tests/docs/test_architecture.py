@@ -1,4 +1,4 @@
-"""architecture.md names the rooms that exist, and the files, classes and methods that it names are there."""
+"""architecture.md names rooms, files and classes that are there, and code cites the rules that protocol.md has."""
 
 import ast
 import re
@@ -41,3 +41,13 @@ def test_what_it_names_exists():
 
 def test_it_stays_short():
     assert len(PAGE.read_text().split()) <= MOST_WORDS
+
+
+def test_the_protocols_rules_are_numbered_without_a_gap_and_code_serves_each_one():
+    page = (ROOT / "docs/reference/protocol.md").read_text()
+    rules = [int(number) for number in re.findall(r"^- \*\*R(\d+)\. ", page, re.MULTILINE)]
+    assert rules == list(range(1, len(rules) + 1))
+    citation = re.compile(r"\bR(\d+)(?=[:,)]| and R\d)")
+    cited = {int(each): str(path) for path in sources(*SIDES) for each in citation.findall((ROOT / path).read_text())}
+    assert {number: path for number, path in cited.items() if number not in rules} == {}
+    assert set(rules) - cited.keys() == set()

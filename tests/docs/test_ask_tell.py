@@ -8,7 +8,6 @@ import sys
 import pytest
 
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.host import reports
 from tests.support.processes import DEADLINE, ROOT, environment
 
 PAGE = ROOT / "docs" / "how-to" / "ask-tell.md"
@@ -23,9 +22,7 @@ def block(language, place=0):
 def fleet(processes):
     """The page's own first commands, at a free port."""
     begin, work = (shlex.split(line, comments=True)[1:] for line in block("sh").splitlines())
-    processes.start(*begin, "--listen", processes.endpoint, "--runs-dir", processes.runs).wait_for_report(
-        reports.ADDRESS, DEADLINE
-    )
+    processes.start(*begin, "--listen", processes.endpoint, "--runs-dir", processes.runs).wait_until_serving()
     processes.start(*work, "--connect", processes.endpoint, "--slots", 1)
     return processes
 
@@ -34,8 +31,7 @@ def fleet(processes):
 def bridge(fleet):
     *_, serve = block("sh", 1).splitlines()
     words = ["--port", "0", *shlex.split(serve.replace(ADDRESS, fleet.endpoint), comments=True)[2:]]
-    process = fleet.start("serve", *words)
-    return process.wait_for_report(reports.ADDRESS, DEADLINE)
+    return fleet.start("serve", *words).wait_until_serving()
 
 
 def run(*command, where, cache):

@@ -19,12 +19,9 @@ CITATION = ROOT / "CITATION.cff"
 TEMPLATES = sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.md"))
 
 
-def test_the_citation_is_valid():
+def test_the_citation_is_valid_of_this_version_and_of_the_same_authors_as_receipts_say():
     checker = Path(sys.executable).parent / "check-jsonschema"
     subprocess.run([checker, "--builtin-schema", "vendor.citation-file-format", CITATION], check=True, timeout=DEADLINE)
-
-
-def test_the_citation_is_of_this_version_and_of_the_same_authors_as_receipts_say():
     text = CITATION.read_text()
     assert f"version: {Version(version('dreamfleet')).base_version}\n" in text
     assert f"- name: {AUTHORS}\n" in text

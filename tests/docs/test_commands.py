@@ -1,11 +1,13 @@
-"""The commands of pages name verbs and flags that are there, by the reference that is written from the parsers."""
+"""The commands of pages name verbs and flags that are there, and CONTRIBUTING's programs are those that tests need."""
 
 import re
 import shlex
 
 import pytest
 
+from tests.support import programs
 from tests.support.processes import ROOT
+from tests.support.programs import packages, require_programs
 
 PARTS = ("README.md", "CONTRIBUTING.md", "docs/tutorials/*.md", "docs/how-to/*.md", "docs/explanation/*.md")
 PAGES = sorted(path for part in PARTS for path in ROOT.glob(part))
@@ -29,10 +31,8 @@ def test_a_pages_commands_are_there(page):
     for words in commands(page):
         verb = " ".join(words[: 2 if words[0] in GROUPS else 1])
         known = f"{EVERY}{FLAGS.get(verb, '')}"
-        # a text of several flags, as for `--run-flags "--a 1"`, is another verb's
-        flags = [
-            word.partition("=")[0] for word in words if word.startswith("--") and " " not in word.partition("=")[0]
-        ]
+        names = [word.partition("=")[0] for word in words if word.startswith("--")]
+        flags = [name for name in names if " " not in name]  # a text of several flags is another verb's
         wrong += [verb] * (verb not in FLAGS and verb != "VERB")
         wrong += [
             f"{verb} {flag}"
@@ -40,3 +40,19 @@ def test_a_pages_commands_are_there(page):
             if not re.search(rf"{re.escape(flag)}\b", known) and f"`{flag[2:].replace('-', '_')}`" not in SETTINGS
         ]
     assert wrong == [], "docs/reference/verbs.md has the verbs and their flags"
+
+
+def test_contributing_installs_the_packages_of_the_list():
+    (names,) = re.findall(
+        r"^apt-get install --no-install-recommends (.*)", (ROOT / "CONTRIBUTING.md").read_text(), re.MULTILINE
+    )
+    assert names.split() == sorted(packages().values())
+
+
+def test_without_a_program_a_test_is_skipped_for_a_reason_that_all_share_and_fails_in_ci(monkeypatch):
+    monkeypatch.setattr(programs, "SEARCHED", "/nowhere")
+    for in_ci, outcome in (("", pytest.skip.Exception), ("true", pytest.fail.Exception)):
+        monkeypatch.setenv("CI", in_ci)
+        for name in packages():
+            with pytest.raises(outcome, match=re.escape(" ".join(packages().values()))):
+                require_programs(name)

@@ -49,12 +49,9 @@ def test_a_choice_is_held_until_the_dream_ends_and_no_longer(small):
     steps = [single.step(script.ACTIONS[[1, 3]]) for _ in range(8)]
     first, second = (script.hold(dreams, np.array([1, 3])) for _ in range(2))
     assert not first.over.any()
-    assert np.array_equal(first.reward, sum(step[1] for step in steps[:4]))
-    assert np.array_equal(first.after, steps[3][0])
-    assert np.array_equal(first.now, steps[3][0])
     assert second.over.all()
-    assert not second.failed.any()
-    assert not second.last.any()
-    assert np.array_equal(second.reward, steps[4][1] + steps[5][1])
-    assert np.array_equal(second.after, steps[5][0])
-    assert np.array_equal(second.now, steps[7][0])
+    assert not (second.failed | second.last).any()
+    for held, played, after, now in ((first, steps[:4], 3, 3), (second, steps[4:6], 5, 7)):
+        assert np.array_equal(held.reward, sum(step[1] for step in played))
+        assert np.array_equal(held.after, steps[after][0])
+        assert np.array_equal(held.now, steps[now][0])

@@ -24,26 +24,26 @@ SMALL = "--population", 4, "--evaluate-every", 0
 def three_hosts(folder):
     """The prefix of a command for each host: a namespace with its address, and a folder of its own."""
 
-    def ip(*words):
-        subprocess.run(["ip", *words], check=True, capture_output=True)
+    def ip(words):
+        subprocess.run(["ip", *words.split()], check=True, capture_output=True)
 
     tag = secrets.token_hex(3)
     inside = {name: f"df{tag}{name}" for name in HOSTS}
     with ExitStack() as stack:
         for name, space in inside.items():
-            ip("netns", "add", space)
-            stack.callback(ip, "netns", "del", space)
-            ip("-n", space, "link", "set", "lo", "up")
+            ip(f"netns add {space}")
+            stack.callback(ip, f"netns del {space}")
+            ip(f"-n {space} link set lo up")
             (folder / name).mkdir()
-        ip("-n", inside["home"], "link", "add", "switch", "type", "bridge")
-        ip("-n", inside["home"], "addr", "add", f"{HOSTS['home']}/24", "dev", "switch")
-        ip("-n", inside["home"], "link", "set", "switch", "up")
+        home = inside["home"]
+        ip(f"-n {home} link add switch type bridge")
+        ip(f"-n {home} addr add {HOSTS['home']}/24 dev switch")
+        ip(f"-n {home} link set switch up")
         for name in ("red", "blue"):
-            ip("-n", inside["home"], "link", "add", name, "type", "veth", "peer", "name", "cable",
-               "netns", inside[name])  # fmt: skip
-            ip("-n", inside["home"], "link", "set", name, "master", "switch", "up")
-            ip("-n", inside[name], "addr", "add", f"{HOSTS[name]}/24", "dev", "cable")
-            ip("-n", inside[name], "link", "set", "cable", "up")
+            ip(f"-n {home} link add {name} type veth peer name cable netns {inside[name]}")
+            ip(f"-n {home} link set {name} master switch up")
+            ip(f"-n {inside[name]} addr add {HOSTS[name]}/24 dev cable")
+            ip(f"-n {inside[name]} link set cable up")
         yield {
             name: ("ip", "netns", "exec", space, "env", "-C", str(folder / name), f"HOME={folder / name}",
                    f"DREAMFLEET_CACHE={folder / name / 'cache'}")

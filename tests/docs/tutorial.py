@@ -11,16 +11,13 @@ from tests.support.processes import DEADLINE, ROOT, free_port
 WHOLE = 3 * DEADLINE  # seconds that a page's commands may take together
 
 
-def run_tutorial(page, module, shares, folder):
-    """What a tutorial's commands print, as `run_page`; `module` is the file of its Python block."""
-    (code,) = _blocks((ROOT / "docs" / "tutorials" / page).read_text(), "python")
-    (folder / module).write_text(code)
-    return run_page(f"tutorials/{page}", shares, folder)
-
-
 def run_page(page, shares, folder):
-    """What a page's commands print, but for its first block, which installs."""
-    install, *commands = _blocks((ROOT / "docs" / page).read_text(), "sh")
+    """What a page's commands print, but for its first block, which installs; its Python is the module that it names."""
+    text = (ROOT / "docs" / page).read_text()
+    for code in _blocks(text, "python"):
+        (module,) = set(re.findall(r"`(\w+\.py)`", text))
+        (folder / module).write_text(code)
+    install, *commands = _blocks(text, "sh")
     assert "pip install" in install
     script = "".join(commands)
     for whole, share in shares.items():

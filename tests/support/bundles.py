@@ -1,6 +1,8 @@
 """World models with random weights."""
 
 import io
+import struct
+import zipfile
 from dataclasses import replace
 from math import sqrt
 
@@ -95,6 +97,26 @@ def npy(array):
     buffer = io.BytesIO()
     np.save(buffer, array)
     return buffer.getvalue()
+
+
+def npy_header(shape, kind="<f4"):
+    """The first bytes of an array's file; `shape` is text, and may be none that numpy writes."""
+    text = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
+
+
+def parts_of(bundle):
+    return {name: bundle.read(name) for name in bundle.manifest.parts}
+
+
+def rewrite(path, change):
+    """Change each member of an archive in its place; one that becomes `None` is left out."""
+    with zipfile.ZipFile(path) as archive:
+        entries = [(name, archive.read(name)) for name in archive.namelist()]
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in entries:
+            if (changed := change(name, data)) is not None:
+                archive.writestr(name, changed)
 
 
 def states(count, vae=PAPER, rnn=REWARDED, seed=0):

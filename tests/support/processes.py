@@ -5,6 +5,7 @@ import io
 import json
 import os
 import queue
+import select
 import socket
 import subprocess
 import threading
@@ -63,6 +64,13 @@ def until(found, what="what is waited for"):
     while not found():
         assert time.monotonic() < deadline, f"{what} did not come"
         time.sleep(0.05)
+
+
+def ends(pidfd):
+    """Whether the process of this descriptor ends in time; the descriptor is closed."""
+    has_ended = bool(select.select([pidfd], [], [], DEADLINE)[0])
+    os.close(pidfd)
+    return has_ended
 
 
 @contextmanager

@@ -1,5 +1,3 @@
-"""A live run in a notebook: its card, and a real notebook that shows it in place."""
-
 import dataclasses
 import re
 
@@ -48,18 +46,13 @@ def test_a_chart_stays_within_its_picture_whatever_the_fitness():
         assert all(0 <= float(value) <= 560 for pair in numbers for value in pair.split(","))
 
 
-def test_a_terminal_gets_a_line_of_each(capsys):
-    show_live([STATUS, STATUS])
-    assert capsys.readouterr().out.count("<Status of night") == 2
-
-
-def test_an_interrupt_ends_the_showing_alone(capsys):
+def test_a_terminal_gets_a_line_of_each_until_an_interrupt(capsys):
     def statuses():
-        yield STATUS
+        yield from (STATUS, STATUS)
         raise KeyboardInterrupt
 
     show_live(statuses())
-    assert "<Status of night" in capsys.readouterr().out
+    assert capsys.readouterr().out.count("<Status of night") == 2
 
 
 @pytest.mark.slow

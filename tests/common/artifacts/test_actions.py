@@ -3,55 +3,48 @@ import re
 import numpy as np
 import pytest
 
-from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Continuous, Mirror, one_hot
+from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Continuous, Mirror, grouped, one_hot
 from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.errors import UsageError
 
-ONE_PEDAL = Variant(pedals="one").controls
+ONE_PEDAL, FIVE = Variant(pedals="one").controls, Variant(actions="discrete").controls
 
 
 def logits(*outputs):
     return np.arctanh(np.array(outputs, np.float32))
 
 
-def test_one_pedal_is_gas_above_zero_and_brake_below():
-    assert (ONE_PEDAL.outputs, ONE_PEDAL.actions) == (2, 3)
-    for pedal, gas, brake in ((0.75, 0.75, 0), (-0.5, 0, 0.5), (0.0, 0, 0)):
-        np.testing.assert_allclose(ONE_PEDAL.to_action(logits(0.25, pedal)), [0.25, gas, brake], atol=1e-6)
-
-
-def test_a_shifted_pedal_gives_gas_where_its_output_is_zero():
-    shifted = Variant(pedals="one", pedal_shift=0.25).controls
-    for pedal, gas, brake in ((0.0, 0.25, 0), (-0.25, 0, 0), (-0.5, 0, 0.25), (0.9, 1, 0)):
-        np.testing.assert_allclose(shifted.to_action(logits(0.0, pedal)), [0, gas, brake], atol=1e-6)
-
-
-def test_a_brake_with_a_shared_output_responds_to_every_change():
-    """By default the brake is constant while its output is below zero, so small changes have no effect there."""
-    near = [np.array([0, pedal], np.float32) for pedal in (0.3, 0.31, -0.3, -0.31)]
-    assert len({ONE_PEDAL.to_action(each).tobytes() for each in near}) == 4
-    flat = [np.array([0, 0, brake], np.float32) for brake in (-0.3, -0.31)]
-    assert np.array_equal(*(STEERING_GAS_BRAKE.to_action(each) for each in flat))
+@pytest.mark.parametrize(
+    ("shift", "pressed"),
+    [
+        (0.0, [(0.75, 0.75, 0), (-0.5, 0, 0.5), (0.0, 0, 0)]),
+        (0.25, [(0.9, 1, 0), (0.0, 0.25, 0), (-0.25, 0, 0), (-0.5, 0, 0.25)]),
+    ],
+)
+def test_one_pedal_is_gas_above_its_shift_and_brake_below(shift, pressed):
+    controls = Variant(pedals="one", pedal_shift=shift).controls
+    assert (controls.outputs, controls.actions) == (2, 3)
+    for pedal, gas, brake in pressed:
+        np.testing.assert_allclose(controls.to_action(logits(0.25, pedal)), [0.25, gas, brake], atol=1e-6)
 
 
 def test_the_choice_of_the_largest_output_wins_and_the_first_of_equal_ones():
-    five = Variant(actions="discrete").controls
-    assert (five.outputs, five.actions) == (5, 3)
-    assert five.to_action(np.array([9, -1, 0, 9, 3], np.float32)).tolist() == [0, 0, 0]
+    assert (FIVE.outputs, FIVE.actions) == (5, 3)
+    assert FIVE.to_action(np.array([9, -1, 0, 9, 3], np.float32)).tolist() == [0, 0, 0]
     many = np.random.default_rng(0).normal(size=(64, 5)).astype(np.float32) * 9
-    done = five.to_action(many)
-    assert done.dtype == np.float32
-    assert all(np.array_equal(five.to_action(row), action) for row, action in zip(many, done, strict=True))
-    assert np.array_equal(five.to_outputs(done), np.eye(5)[many.argmax(axis=1)])
-    assert not five.to_outputs(np.array([[0.5, 0, 0]], np.float32)).any(), "what is no choice was none"
+    assert np.array_equal(FIVE.to_outputs(FIVE.to_action(many)), np.eye(5)[many.argmax(axis=1)])
+    assert not FIVE.to_outputs(np.array([[0.5, 0, 0]], np.float32)).any(), "what is no choice was none"
+    assert one_hot(3).to_action(np.array([[2, 1, 0], [0, 0, 0], [-3, -2, -1]])).argmax(axis=1).tolist() == [0, 0, 2]
+    with pytest.raises(UsageError):
+        one_hot(0)
 
 
-def test_a_batch_of_actions_equals_single_actions():
-    many = np.random.default_rng(0).normal(size=(256, 2)).astype(np.float32)
-    together = ONE_PEDAL.to_action(many)
-    assert together.shape == (256, 3)
-    assert together.dtype == np.float32
-    assert all(np.array_equal(ONE_PEDAL.to_action(row), action) for row, action in zip(many, together, strict=True))
+@pytest.mark.parametrize("controls", [ONE_PEDAL, STEERING_GAS_BRAKE, FIVE, one_hot(3), grouped([3, 2, 1], bits=[1])])
+def test_a_batch_of_actions_equals_single_actions(controls):
+    many = np.random.default_rng(0).normal(size=(64, controls.outputs)).astype(np.float32) * 9
+    together = controls.to_action(many)
+    assert (together.shape, together.dtype) == ((64, controls.actions), np.float32)
+    assert all(np.array_equal(controls.to_action(row), action) for row, action in zip(many, together, strict=True))
 
 
 def test_actions_convert_back_to_outputs():
@@ -90,14 +83,3 @@ def test_a_mirror_widens_no_action(shape):
 def test_a_mirror_orders_each_column_once(order, signs):
     with pytest.raises(UsageError):
         Mirror(order, signs)
-
-
-def test_one_of_some_actions_is_a_row_of_zeros_and_a_one():
-    three = one_hot(3)
-    assert (three.outputs, three.actions) == (3, 3)
-    logits = np.array([[2, 1, 0], [0, 0, 0], [-3, -2, -1]], np.float32)
-    chosen = three.to_action(logits)
-    assert chosen.tolist() == [[1, 0, 0], [1, 0, 0], [0, 0, 1]]
-    assert np.array_equal(three.to_outputs(chosen), chosen)
-    with pytest.raises(UsageError):
-        one_hot(0)

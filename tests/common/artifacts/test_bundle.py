@@ -1,9 +1,10 @@
-"""Tests bundle.py and bundle_store.py."""
+"""Bundles, whole and as deltas without the parts of their base. Tests bundle.py and bundle_store.py."""
 
+import json
 import os
 import re
 import shutil
-import zipfile
+from zipfile import ZipFile
 
 import numpy as np
 import onnx
@@ -22,43 +23,35 @@ from dreamfleet.common.artifacts.bundle import (
     hash_file,
     write_bundle,
 )
-from dreamfleet.common.artifacts.bundle_store import BundleStore, describe_bundle, find_bundle, shipped_bundles
+from dreamfleet.common.artifacts.bundle_store import (
+    DELTA_MANIFEST,
+    BundleStore,
+    describe_bundle,
+    find_bundle,
+    shipped_bundles,
+)
 from dreamfleet.common.errors import BundleError
+from dreamfleet.common.files.archives import write_archive
 from dreamfleet.worker.worldmodel.inference import PolicyStep
-from tests.support.bundles import states, write_random_bundle
+from tests.support.bundles import parts_of, rewrite, states, write_random_bundle
 
 LARGEST_SHIPPED = 16_000_000
-
-
-def parts_of(bundle):
-    return {name: bundle.read(name) for name in bundle.manifest.parts}
 
 
 def test_equal_parts_give_equal_files(random_bundle, tmp_path):
     again = write_bundle(tmp_path / "again.zip", random_bundle.manifest, parts_of(random_bundle))
     assert again.sha256 == random_bundle.sha256 == hash_file(random_bundle.path)
+    assert write_random_bundle(tmp_path / "other.zip", seed=1).sha256 != random_bundle.sha256, "of other weights"
 
 
 def test_shipped_bundles_are_valid_and_small():
-    parameters, errors = {"tiny": 867, "takecover": 963}, {"tiny": 25, "takecover": 40}
-    assert shipped_bundles().keys() == parameters.keys()
-    for name, path in shipped_bundles().items():
+    figures = {"tiny": (867, 25), "takecover": (963, 40)}
+    assert shipped_bundles().keys() == figures.keys()
+    for name, (parameters, error) in figures.items():
         bundle = find_bundle(name)
-        assert path.stat().st_size <= LARGEST_SHIPPED
-        assert bundle.controller_shape.size == parameters[name]
-        assert bundle.manifest.provenance["quality"]["reconstruction_error"] < errors[name]
-
-
-def truncate(path):
-    os.truncate(path, path.stat().st_size // 2)
-
-
-def empty(path):
-    path.write_bytes(b"")
-
-
-def text(path):
-    path.write_text("this is no bundle")
+        assert bundle.path.stat().st_size <= LARGEST_SHIPPED
+        assert bundle.controller_shape.size == parameters
+        assert bundle.manifest.provenance["quality"]["reconstruction_error"] < error
 
 
 def flip_a_byte(path):
@@ -67,42 +60,25 @@ def flip_a_byte(path):
     path.write_bytes(data)
 
 
-def drop_a_part(path):
-    rewrite(path, lambda name, data: None if name == ENCODER else data)
+def in_member(named, change):
+    """Rewrite a bundle with one member changed, or left out for `None`."""
+    return lambda path: rewrite(path, lambda name, data: change(data) if name == named else data)
 
 
-def swap_a_part(path):
-    rewrite(path, lambda name, data: data[::-1] if name == ENCODER else data)
+DAMAGES = {
+    "truncated": lambda path: os.truncate(path, path.stat().st_size // 2),
+    "empty": lambda path: path.write_bytes(b""),
+    "text": lambda path: path.write_text("this is no bundle"),
+    "a flipped byte": flip_a_byte,
+    "a lost part": in_member(ENCODER, lambda data: None),
+    "a swapped part": in_member(ENCODER, lambda data: data[::-1]),
+    "a broken manifest": in_member(MANIFEST, lambda data: b"{"),
+    "a lost manifest": in_member(MANIFEST, lambda data: None),
+    "a later format": in_member(MANIFEST, lambda data: data.replace(b'"format": 1', b'"format": 2')),
+}
 
 
-def break_the_manifest(path):
-    rewrite(path, lambda name, data: b"{" if name == MANIFEST else data)
-
-
-def drop_the_manifest(path):
-    rewrite(path, lambda name, data: None if name == MANIFEST else data)
-
-
-def of_tomorrow(path):
-    rewrite(path, lambda name, data: data.replace(b'"format": 1', b'"format": 2') if name == MANIFEST else data)
-
-
-def rewrite(path, change):
-    with zipfile.ZipFile(path) as archive:
-        entries = [(name, archive.read(name)) for name in archive.namelist()]
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, data in entries:
-            if (changed := change(name, data)) is not None:
-                archive.writestr(name, changed)
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        truncate, empty, text, flip_a_byte, drop_a_part, swap_a_part, break_the_manifest, drop_the_manifest,
-        of_tomorrow,
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
 def test_damage_is_a_one_line_error_that_names_the_file(random_bundle, tmp_path, damage):
     path = tmp_path / "copy.zip"
     shutil.copyfile(random_bundle.path, path)
@@ -119,25 +95,22 @@ def without_nodes(part):
 
 
 @pytest.mark.parametrize("name", [ENCODER, DECODER, POLICY, DREAM_GRAPH, LINEAR_CONTROLLER])
-@pytest.mark.parametrize(
-    "change", [lambda part: b"", without_nodes, lambda part: onnx.ModelProto().SerializeToString()]
-)
+@pytest.mark.parametrize("change", [lambda _: b"", without_nodes, lambda _: onnx.ModelProto().SerializeToString()])
 def test_an_empty_graph_is_refused_with_its_name(random_bundle, tmp_path, name, change):
     parts = parts_of(random_bundle)
     with pytest.raises(BundleError, match=rf"b\.zip.* {name}"):
         write_bundle(tmp_path / "b.zip", random_bundle.manifest, {**parts, name: change(parts[name])})
 
 
-@pytest.mark.parametrize("name", REQUIRED)
-def test_a_bundle_of_any_world_needs_its_dream_and_both_ends_of_its_vae(random_bundle, tmp_path, name):
-    parts = parts_of(random_bundle)
-    del parts[name]
-    with pytest.raises(BundleError):
-        write_bundle(tmp_path / "less.zip", random_bundle.manifest, parts)
+def without(parts, lost):
+    return {name: data for name, data in parts.items() if name != lost}
 
 
-def test_without_graphs_of_its_controllers_a_bundle_drives_by_its_dreams_graph(random_bundle, tmp_path):
+def test_a_bundle_needs_its_dream_and_both_ends_of_its_vae_and_drives_by_the_dreams_graph(random_bundle, tmp_path):
     needed = {name: random_bundle.read(name) for name in REQUIRED}
+    for lost in REQUIRED:
+        with pytest.raises(BundleError):
+            write_bundle(tmp_path / "less.zip", random_bundle.manifest, without(needed, lost))
     bare = write_bundle(tmp_path / "bare.zip", random_bundle.manifest, needed)
     random = np.random.default_rng(3)
     parameters = random.normal(0, 0.3, (2, bare.controller_shape.size)).astype(np.float32)
@@ -176,27 +149,11 @@ def test_the_store_finds_shipped_and_downloaded_bundles(random_bundle, tmp_path)
         shutil.copyfile(random_bundle.path, partial)
         assert store.finish_download(random_bundle.sha256).sha256 == random_bundle.sha256
     assert store.find(random_bundle.sha256) is not None
-
-
-def test_a_damaged_download_is_refused_and_removed(random_bundle, tmp_path):
-    store = BundleStore(tmp_path)
     with store.lock_download(random_bundle.sha256) as partial:
         partial.write_bytes(b"something else")
         with pytest.raises(BundleError, match=random_bundle.sha256[:12]):
             store.finish_download(random_bundle.sha256)
         assert not partial.exists()
-
-
-def test_a_damaged_cached_copy_is_fetched_again(random_bundle, tmp_path):
-    store = BundleStore(tmp_path)
-    with store.lock_download(random_bundle.sha256) as partial:
-        shutil.copyfile(random_bundle.path, partial)
-        flip_a_byte(store.finish_download(random_bundle.sha256).path)
-    assert store.find(random_bundle.sha256) is None
-
-
-def test_other_weights_give_another_hash(random_bundle, tmp_path):
-    assert write_random_bundle(tmp_path / "other.zip", seed=1).sha256 != random_bundle.sha256
 
 
 @pytest.mark.parametrize("name", ["", "abc", "../" * 20 + "etc0", "AB" * 32, "ab" * 31 + "/x"])
@@ -219,3 +176,63 @@ def test_an_error_text_names_what_ships_and_is_no_error_of_a_file_that_is_damage
     (tmp_path / "folder.zip").rmdir()
     (tmp_path / "damaged.lean").write_bytes(b"x")
     assert describe_bundle("ab" * 32).endswith(" abababababab")
+
+
+@pytest.fixture
+def shelf(tmp_path, monkeypatch):
+    """A folder of shipped bundles: `base` whole, and `able` as a delta to it."""
+    folder = tmp_path / "ships"
+    folder.mkdir()
+    monkeypatch.setattr(bundle_store, "pretrained_folder", lambda: folder)
+    monkeypatch.setenv("DREAMFLEET_CACHE", str(tmp_path / "cache"))
+    base = write_random_bundle(folder / "base.zip")
+    other = write_random_bundle(tmp_path / "other.zip", recorded=states(5))
+    shared = parts_of(base)
+    own = {name: other.read(name) for name in other.manifest.parts.keys() - shared.keys()}
+    whole = write_bundle(tmp_path / "whole.zip", other.manifest, {**shared, **own})
+    about = {"sha256": whole.sha256, "base": "base", "parts": [MANIFEST, *sorted(whole.manifest.parts)]}
+    with (folder / "able.lean").open("wb") as file, ZipFile(whole.path) as members:
+        own_parts = [(name, members.read(name)) for name in (MANIFEST, *sorted(own))]
+        write_archive(file, [(DELTA_MANIFEST, json.dumps(about).encode()), *own_parts])
+    return folder, whole
+
+
+def test_rebuilding_gives_the_original_bundle_to_the_byte(shelf):
+    folder, whole = shelf
+    assert (folder / "able.lean").stat().st_size < whole.path.stat().st_size / 3
+    found = BundleStore(bundle_store.default_cache()).find(whole.sha256)  # as a controller finds its world model
+    assert found.path.read_bytes() == whole.path.read_bytes()
+    assert find_bundle("able").path == found.path, "it was put together once"
+    with pytest.raises(BundleError, match="base, able"):
+        find_bundle("nobody")
+
+
+def test_a_damaged_cached_copy_is_rebuilt(shelf):
+    _, whole = shelf
+    find_bundle("able").path.write_bytes(b"damaged")
+    assert find_bundle("able").sha256 == whole.sha256
+
+
+@pytest.mark.parametrize(
+    "harm",
+    [
+        lambda folder: (folder / "able.lean").write_bytes(b""),
+        lambda folder: (folder / "able.lean").write_bytes((folder / "able.lean").read_bytes()[:-100]),
+        lambda folder: (folder / "base.zip").unlink(),
+        lambda folder: (folder / "base.zip").write_bytes(b"no zip"),
+        lambda folder: write_random_bundle(folder / "base.zip", seed=9),
+    ],
+)
+def test_a_damaged_delta_or_missing_base_is_an_error(shelf, harm):
+    folder, _ = shelf
+    harm(folder)
+    with pytest.raises(BundleError) as raised:
+        find_bundle("able")
+    assert "\n" not in str(raised.value)
+
+
+def test_an_unwritable_cache_is_an_error(shelf, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setenv("DREAMFLEET_CACHE", str(tmp_path / "file"))
+    with pytest.raises(BundleError, match=re.escape(str(tmp_path / "file"))):
+        find_bundle("able")

@@ -20,9 +20,14 @@ MIXED = {
 def test_zero_is_x0_and_a_step_is_the_scale():
     objective = Objective.of(MIXED)
     assert objective.decode(np.zeros(5)).tolist() == pytest.approx([0.5, 3, 10, -2, 4])
-    moved = objective.decode([1, 1, 1, -1, 1])
-    assert moved.tolist() == pytest.approx([0.6, 4, 10 * np.e, -4, 5])
+    assert objective.decode([1, 1, 1, -1, 1]).tolist() == pytest.approx([0.6, 4, 10 * np.e, -4, 5])
     assert objective.decode([0, 0.4, 0, 0, 0])[1] == 3
+
+
+@given(st.floats(-50, 50), st.floats(0, 1e-3))
+def test_reflection_makes_no_jump(place, step):
+    box = Objective.of({"x0": [0.5], "lower": 0, "upper": 1})
+    assert abs(box.decode([place + step])[0] - box.decode([place])[0]) <= step + 1e-12
 
 
 @given(st.lists(st.floats(-(2.0**100), 2.0**100, width=32), min_size=5, max_size=5))
@@ -33,12 +38,6 @@ def test_arguments_lie_within_bounds_wherever_the_search_goes(coordinates):
     assert x[1] in (1, 2, 3, 4, 5)
     assert 1 <= x[2] <= 1000
     assert x[3] <= 0
-
-
-@given(st.floats(-50, 50), st.floats(0, 1e-3))
-def test_reflection_makes_no_jump(place, step):
-    box = Objective.of({"x0": [0.5], "lower": 0, "upper": 1})
-    assert abs(box.decode([place + step])[0] - box.decode([place])[0]) <= step + 1e-12
 
 
 def test_every_whole_number_is_as_probable_as_another():
@@ -64,11 +63,7 @@ def test_options_come_back_and_equal_numbers_are_one():
         assert Objective.parse(objective.options) == objective
     assert json.loads(Objective.of({"x0": [0, 0, 0]}).options) == {"environment": {"dimension": 3, "x0": 0.0}}
     assert len(Objective.of({"x0": 0, "dimension": 10**4}).options) < 100
-
-
-def test_the_sign_turns_fitness_into_a_value_and_back():
-    assert Objective.of({"x0": [0], "minimise": True}).value(3.0) == -3.0
-    assert Objective.of({"x0": [0]}).value(3.0) == 3.0
+    assert [Objective.of({"x0": [0], "minimise": sign}).value(3.0) for sign in (True, False)] == [-3.0, 3.0]
 
 
 def test_equal_bounds_fix_a_parameter():
@@ -84,33 +79,21 @@ def test_equal_bounds_fix_a_parameter():
     "arguments",
     [
         {},
-        {"x0": []},
-        {"x0": ["a"]},
-        {"x0": [float("nan")]},
-        {"x0": [True]},
-        {"x0": [0, 0], "dimension": 3},
-        {"x0": [0, 0], "lower": [1]},
-        {"x0": [0], "lower": 1},
+        *({"x0": odd} for odd in ([], ["a"], [float("nan")], [True])),
+        *({"x0": [0], **odd} for odd in ({"lower": 1}, {"scale": 0}, {"log": [0]})),
+        *({"x0": [0, 0], **odd} for odd in ({"dimension": 3}, {"lower": [1]})),
         {"x0": [1, 2], "lower": [1, 2], "upper": [1, 2]},
-        {"x0": [0], "scale": 0},
-        {"x0": [0], "log": [0]},
         {"x0": [1], "log": True, "lower": 0},
-        {"x0": [1], "integer": [1]},
-        {"x0": [1], "minimise": "yes"},
-        {"x0": [1], "penalty": [1, 2]},
+        *({"x0": [1], **odd} for odd in ({"integer": [1]}, {"minimise": "yes"}, {"penalty": [1, 2]}, {"step": 3})),
         {"x0": 1, "dimension": 0},
-        {"x0": [1], "step": 3},
     ],
 )
 def test_what_describes_no_function_is_refused(arguments):
     with pytest.raises(UsageError):
         Objective.of(arguments)
-
-
-@pytest.mark.parametrize("text", ["", "3", "[]", "{}", '{"environment": 3}'])
-def test_options_of_something_else_are_refused(text):
-    with pytest.raises(UsageError):
-        Objective.parse(text)
+    for text in ("", "3", "[]", "{}", '{"environment": 3}'):
+        with pytest.raises(UsageError):
+            Objective.parse(text)
 
 
 def test_a_second_parameter_named_seed_makes_a_function_noisy():

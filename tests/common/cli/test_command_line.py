@@ -10,6 +10,7 @@ import time
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dreamfleet.common.cli import command_line
@@ -34,24 +35,17 @@ def points(*more):
         (("coordinator", "--populaton", "8"), "--populaton 8 --population"),
         (("coordinator", "--evaluate-evry=3"), "--evaluate-every"),
         (("record", "--controler", "real"), "--controler --controller"),
-        (("coordinator", "--workers", "2"), "--workers"),
         (("coordinator", "--popsize", "8"), "--popsize 8 --population"),
         (("runs", "export", "dream", "--csv", "out.csv"), "--csv 'out.csv'"),
-        (("runs", "export", "--csv", "out.csv"), "--csv"),
-        (("worker", "--conect", "tcp/a:1"), "--connect"),
         (("coordinator", "--gen", "3"), "--gen 3 --generations"),
-        (("evaluate", "--ep", "3"), "--episodes"),
-        (("coordinator", "--see", "3"), "--seed"),
         (("coordinator", "--r", "x"), "--run --resume --runs-dir --racing --recorded"),
         (("coordinator", "--", "--run", "x"), "--run"),
         (("train", "--dat", "d", "vae"), "--dat --data"),
-        (("drain", "--con", "tcp/a:1", "w"), "--connect --config"),
         (("iterate", "--rounds", "x", "--run-flags", "--gener 1"), "--rounds 'x'"),
         (("evaluate", "--tracks", "3"), "--tracks --episodes"),
         (("evaluate", "real"), "'real' --controller real"),
-        (("record", "real"), "'real' --controller real"),
-        (("train", "vae", "--data", "x", "--updats", "3"), "--updates"),
         (("status", "--xyzzy"), "--xyzzy dreamfleet status"),
+        (("runs", "list", "--runs-dir", ""), "--runs-dir"),
     ],
 )
 def test_the_error_for_an_unknown_flag_suggests_the_nearest(words, named, capsys):
@@ -72,7 +66,6 @@ def test_the_error_for_an_unknown_flag_suggests_the_nearest(words, named, capsys
         (("run", "list"), "'run'.* 'runs list'"),
         (("receipt", "night"), "'receipt'.* 'runs receipt'"),
         (("export",), "'export'.* 'baseline export' or 'runs export'"),
-        (("lab", "benhc"), "'lab benhc'.* 'lab bench'"),
         (("xyzzy",), "'xyzzy'.* `dreamfleet --help`"),
     ],
 )
@@ -81,16 +74,13 @@ def test_the_error_for_an_unknown_verb_suggests_the_nearest(words, named, capsys
     assert re.search(named, capsys.readouterr().err)
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "named"),
-    [((), 2, "--help"), (("runs",), 2, "--help"), (("--help",), 0, "130"), (("runs", "--help"), 0, "130"),
-     (("worker", "--help"), 0, "130"), (("train", "vae", "--help"), 0, "130")],
-)  # fmt: skip
-def test_help_lists_the_exit_codes_and_a_missing_verb_names_it(words, code, named, capsys):
+@pytest.mark.parametrize("words", ["--help", "runs --help", "worker --help", "train vae --help", "", "runs"])
+def test_help_lists_the_exit_codes_and_a_missing_verb_names_it(words, capsys):
     with pytest.raises(SystemExit) as left:
-        command_line.main(words)
-    assert left.value.code == code
-    assert named in "".join(capsys.readouterr())
+        command_line.main(words.split())
+    is_help = words.endswith("--help")
+    assert left.value.code == (0 if is_help else UsageError.exit_code)
+    assert ("130" if is_help else "--help") in "".join(capsys.readouterr())
 
 
 def test_a_broken_verb_does_not_affect_others(capsys, tmp_path):
@@ -104,12 +94,6 @@ def test_a_broken_verb_does_not_affect_others(capsys, tmp_path):
         command_line.run_verb(points(BROKEN), ["broken"])
 
 
-def test_the_module_and_the_version():
-    command = [sys.executable, "-m", "dreamfleet", "--version"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=DEADLINE)
-    assert re.fullmatch(r"dreamfleet \d+\.\d+\.\d+\S*\n", done.stdout)
-
-
 def test_closed_streams_are_replaced(tmp_path):
     program = (
         "import os, sys; from dreamfleet.common.cli.command_line import main; assert sys.stdout is None; "
@@ -120,25 +104,17 @@ def test_closed_streams_are_replaced(tmp_path):
     assert number > LAST_STREAM
 
 
-@pytest.mark.parametrize("name", sorted(points()))
-def test_two_dashes_are_no_flags_value(name):
-    parser = command_line.build_parser(name, points()[name].load())
-    for flag in flags_with_values(parser):
-        with pytest.raises(UsageError, match=flag):
-            parser.parse_all([f"{flag}=--"])
-
-
-def test_an_empty_path_is_refused(capsys):
-    assert command_line.main(["runs", "list", "--runs-dir", ""]) == UsageError.exit_code
-    assert "--runs-dir" in capsys.readouterr().err
-
-
-def test_a_missing_folder_of_runs_is_an_error_where_it_was_named(tmp_path, monkeypatch, capsys):
+def test_a_missing_folder_of_runs_is_an_error_where_it_was_named_and_a_lack_of_memory_anywhere(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     assert command_line.main(["runs", "list"]) == 0
     for place in (tmp_path / "missing", Path("/dev/null")):
         assert command_line.main(["runs", "list", "--runs-dir", str(place)]) == UsageError.exit_code
         assert f"--runs-dir {place}" in capsys.readouterr().err
+    monkeypatch.setattr(command_line, "run_verb", lambda *_: np.zeros(2**50))
+    assert command_line.main(["tasks"]) == 1
+    assert re.fullmatch(r".*\(Unable to allocate .*\).*\n", capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("name", ["x" * 5000, "\udcff\udc80", "a\nb\x1b[2J", "a\0b"])
@@ -152,10 +128,9 @@ def test_an_impossible_name_is_one_short_printable_line(name, tmp_path, capsys):
         assert len(said) < 1500
 
 
-def run_program(*words, cwd=None, out=subprocess.PIPE, err=subprocess.PIPE, before=(), **environment):
+def run_program(*words, out=subprocess.PIPE, err=subprocess.PIPE, before=(), **environment):
     command = [*before, sys.executable, "-P", "-m", "dreamfleet", *map(str, words)]
-    return subprocess.run(command, cwd=cwd, stdout=out, stderr=err, env={**os.environ, **environment}, check=False,
-                          timeout=DEADLINE)  # fmt: skip
+    return subprocess.run(command, stdout=out, stderr=err, env=os.environ | environment, check=False, timeout=DEADLINE)
 
 
 def test_a_stream_of_ascii_takes_every_text():
@@ -174,9 +149,8 @@ def test_a_full_disk_under_stderr_ends_no_verb(tmp_path):
 
 
 def test_a_deleted_current_folder_is_one_line(tmp_path):
-    done = run_program(
-        "doctor", before=("sh", "-c", f'mkdir {tmp_path}/x; cd {tmp_path}/x; rmdir ../x; exec "$@"', "-")
-    )
+    in_a_deleted_folder = ("sh", "-c", f'mkdir {tmp_path}/x; cd {tmp_path}/x; rmdir ../x; exec "$@"', "-")
+    done = run_program("doctor", before=in_a_deleted_folder)
     assert (done.returncode, done.stderr.count(b"\n")) == (UsageError.exit_code, 1)
 
 
@@ -194,7 +168,7 @@ sys.exit(main())
 """
 
 
-@pytest.mark.parametrize("number", [1, 10, 40, 120, 200, 240])
+@pytest.mark.parametrize("number", [1, 40, 120, 240])
 def test_ctrl_c_amid_an_import_leaves_no_traceback(number):
     command = [sys.executable, "-c", INTERRUPTED_AT_AN_IMPORT, str(number), "runs", "show", "dream", "--runs-dir", RUNS]
     done = subprocess.run(command, capture_output=True, check=False, timeout=DEADLINE)
@@ -202,15 +176,28 @@ def test_ctrl_c_amid_an_import_leaves_no_traceback(number):
     assert done.returncode in (0, -signal.SIGINT, command_line.EXIT_INTERRUPTED)  # a shell says 130 of both
 
 
-def test_an_import_that_turns_ctrl_c_into_another_error_is_still_interrupted(monkeypatch, capsys):
-    def run(_args):
-        try:
-            signal.raise_signal(signal.SIGINT)
-        except KeyboardInterrupt as error:
-            raise RuntimeError("Error calling __set_name__") from error
+def turn_into_another_error(_args):
+    """As the import of a class does."""
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt as error:
+        raise RuntimeError("Error calling __set_name__") from error
 
-    verb = command_line.SimpleVerb("odd", lambda parser: None, run)
-    monkeypatch.setattr(command_line, "load_verb", lambda _point: verb)
+
+def interrupt_in_a_finaliser(_args):
+    class Finalised:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    item = Finalised()
+    del item
+    time.sleep(DEADLINE)
+    raise AssertionError("it slept on")
+
+
+@pytest.mark.parametrize("run", [turn_into_another_error, interrupt_in_a_finaliser])
+def test_ctrl_c_that_user_code_swallows_is_not_lost(run, monkeypatch, capsys):
+    monkeypatch.setattr(command_line, "load_verb", lambda _: command_line.SimpleVerb("odd", lambda parser: None, run))
     before = signal.getsignal(signal.SIGINT)
     assert command_line.main(["tasks"]) == command_line.EXIT_INTERRUPTED
     assert capsys.readouterr().err.count("\n") == 1
@@ -235,33 +222,6 @@ def test_a_missing_package_is_said_first_with_the_verbs_extras_and_its_own(
     assert not list(tmp_path.iterdir())
 
 
-def test_ctrl_c_in_a_finaliser_is_not_lost(monkeypatch, capsys):
-    class Finalised:
-        def __del__(self):
-            signal.raise_signal(signal.SIGINT)
-
-    def run(_args):
-        item = Finalised()
-        del item
-        time.sleep(DEADLINE)
-        raise AssertionError("it slept on")
-
-    monkeypatch.setattr(command_line, "load_verb", lambda _: command_line.SimpleVerb("odd", lambda parser: None, run))
-    assert command_line.main(["tasks"]) == command_line.EXIT_INTERRUPTED
-    assert capsys.readouterr().err.count("\n") == 1
-
-
-def test_a_lack_of_memory_is_one_line(monkeypatch, capsys):
-    def fail(*_):
-        raise MemoryError("Unable to allocate 81.7 GiB")
-
-    monkeypatch.setattr("dreamfleet.common.cli.command_line.run_verb", fail)
-    assert command_line.main(["tasks"]) == 1
-    error = capsys.readouterr().err
-    assert "(Unable to allocate 81.7 GiB)" in error
-    assert error.count("\n") == 1
-
-
 SILENT = ("completion", "dashboard", "demo", "router", "serve", "worker")  # for a person who watches, or for nobody
 
 
@@ -277,15 +237,9 @@ def test_help_shows_the_first_flags_and_help_all_the_rest(name):
     assert len(short.splitlines()) <= 75
     assert f"`{parser.prog} --help-all` shows " in short
     assert all(flag in whole for flag in known if not flag.startswith("--no-"))
-
-
-def test_what_other_programs_call_a_verb_is_there():
-    assert {*command_line.OTHER_NAMES.values()} <= {*points(), "--help"}
-
-
-def test_each_verb_stands_once_in_the_overview():
-    named = [name for entries in GROUPS.values() for names in entries for name in names]
-    assert sorted(named) == sorted(points())
+    for flag in flags_with_values(parser):
+        with pytest.raises(UsageError, match=flag):
+            parser.parse_all([f"{flag}=--"])
 
 
 def test_the_overview_fits_a_terminal_and_loads_no_verb(capsys, monkeypatch):
@@ -297,3 +251,5 @@ def test_the_overview_fits_a_terminal_and_loads_no_verb(capsys, monkeypatch):
     assert max(map(len, lines[: lines.index("Documents")])) <= WIDTH
     assert len(lines) <= 75
     assert Path(lines[-1].strip()).read_text().startswith("# ")  # the documents are in the wheel
+    assert sorted(name for entries in GROUPS.values() for names in entries for name in names) == sorted(points())
+    assert {*command_line.OTHER_NAMES.values()} <= {*points(), "--help"}

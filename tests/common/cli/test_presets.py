@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from functools import partial
 
 import pytest
 
@@ -18,25 +19,17 @@ from dreamfleet.worker.verbs import train
 from tests.support.processes import ROOT
 
 
-def test_the_names_match_the_presets_of_each_side():
+def test_the_names_match_the_presets_of_each_side_and_an_error_names_the_other_kind():
     assert set(NAMES["run"]) == set(runs.PRESETS)
     assert set(NAMES["training"]) == set(presets.PRESETS)
     assert set(NAMES["baseline"]) == set(baselines.PRESETS)
-
-
-def test_a_flag_changes_what_a_presets_first_stage_does():
-    for settings in runs.PRESETS.values():
-        named, _ = split_first_stage(settings.get("stages", ()))
-        assert not named, "it would hide the flag of that name"
-
-
-def test_the_error_names_the_other_kind_of_a_preset():
-    with pytest.raises(UsageError, match="training"):
-        check_preset("run", "attentive")
-    with pytest.raises(UsageError, match="run"):
-        presets.find_preset("dream")
-    with pytest.raises(UsageError, match="training"):
-        baselines.find_preset("tiny")
+    for find, name, kind in (
+        (partial(check_preset, "run"), "attentive", "training"),
+        (presets.find_preset, "dream", "run"),
+        (baselines.find_preset, "tiny", "training"),
+    ):
+        with pytest.raises(UsageError, match=kind):
+            find(name)
 
 
 def test_help_lists_each_presets_values():
@@ -53,6 +46,8 @@ def test_docs_list_each_run_presets_values():
     described = dict(re.findall(r"^\| `([\w-]+)` \| `(--[^`]+)`", page, re.MULTILINE))
     assert described.keys() == runs.PRESETS.keys()
     for name, flags in described.items():
+        named, _ = split_first_stage(runs.PRESETS[name].get("stages", ()))
+        assert not named, "it would hide the flag of that name"
         said = vars(build_parser("coordinator", coordinator).parse_all(shlex.split(flags)))
         settings = {key: value for key, value in runs.PRESETS[name].items() if key not in ("stages", "preset_variant")}
         if variant := runs.PRESETS[name].get("preset_variant"):

@@ -1,5 +1,3 @@
-"""Generations in a row whose candidates all have one fitness."""
-
 from dataclasses import replace
 
 import pytest
@@ -18,7 +16,10 @@ FAILED = replace(EQUAL, failed=1)
     [([], 0), ([EQUAL], 1), ([OTHER, EQUAL, EQUAL], 2), ([EQUAL, OTHER], 0), ([EQUAL, FAILED, EQUAL], 1)],
 )
 def test_the_last_generations_in_a_row_are_counted(rows, count):
-    assert EqualFitness(rows).count == count
+    found = EqualFitness(rows)
+    assert found.count == count
+    assert not found.has_risen, "no fitness lies above the worst of the run"
+    assert EqualFitness([replace(EQUAL, worst=0.0), *rows, EQUAL]).has_risen
 
 
 @pytest.mark.parametrize(("others", "warned"), [(1, [ENOUGH]), (ENOUGH - 1, [ENOUGH]), (ENOUGH, [ENOUGH, 3 * ENOUGH])])
@@ -33,11 +34,6 @@ def test_a_spell_is_warned_of_again_only_after_as_many_other_generations(others,
     found = EqualFitness([EQUAL] * ENOUGH)  # as of a run that is continued
     found.add(EQUAL)
     assert not found.is_due
-
-
-def test_a_fitness_above_the_worst_of_the_run_is_no_lack_of_rewards():
-    assert not EqualFitness([EQUAL, OTHER, EQUAL]).has_risen
-    assert EqualFitness([replace(EQUAL, worst=0.0), EQUAL]).has_risen
 
 
 def test_enough_of_them_are_warned_of():

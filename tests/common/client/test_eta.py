@@ -5,13 +5,13 @@ import re
 
 import pytest
 
-from dreamfleet.common.client.eta import estimate_eta
+from dreamfleet.common.client.eta import Rest, estimate_eta
 from dreamfleet.common.client.run_view import LiveRunView
 from dreamfleet.common.client.status import EpisodeProgress, FailureStatus, GenerationStatus, Throughput, WorkerCount
 from dreamfleet.common.printable import format_duration
 from tests.support.samples import BEST, CLOSED, STATUS
 
-WORKER = STATUS.worker_list[0]
+LEFT = dataclasses.replace(STATUS.worker_list[0], state="left", reason="no memory")
 
 
 def status(limits=(), seconds=0.0, gone=0.0, **changes):
@@ -23,15 +23,21 @@ def status(limits=(), seconds=0.0, gone=0.0, **changes):
     )  # fmt: skip
 
 
-def test_a_limit_of_minutes():
+def with_speed(status, candidates=None, evaluations=None):
+    throughput = dataclasses.replace(
+        status.throughput, episodes_per_second=candidates, evaluation_episodes_per_second=evaluations
+    )
+    return dataclasses.replace(status, throughput=throughput)
+
+
+def test_a_limit_of_minutes_and_the_pace_without_a_generation_that_was_paused():
     eta = estimate_eta(status({"minutes": 30.0}, seconds=18 * 60))
     assert eta.description == "18 of 30 minutes, 4.6 s a generation, about 12 min to go"
     assert eta.share == eta.limits[0].share == pytest.approx(0.6)
     assert eta.seconds == pytest.approx(12 * 60)
-
-
-def test_a_paused_generation_does_not_change_the_pace():
-    assert estimate_eta(status()).pace == 4.6
+    eta = estimate_eta(status({"generations": 1000, "minutes": 30.0}, seconds=18 * 60))
+    assert [each.name for each in eta.limits] == ["minutes", "generations"], "the nearest first"
+    assert eta.seconds == eta.limits[0].seconds
 
 
 def test_the_pace_counts_the_evaluations_between():
@@ -73,34 +79,13 @@ def test_steps_are_estimated_from_the_rate_of_closed_generations():
     assert eta.seconds == pytest.approx(20.0)
 
 
-def test_the_nearest_of_several_limits_is_first_and_counts():
-    eta = estimate_eta(status({"generations": 1000, "minutes": 30.0}, seconds=18 * 60))
-    assert [each.name for each in eta.limits] == ["minutes", "generations"]
-    assert eta.seconds == eta.limits[0].seconds
-
-
-def with_speed(status, candidates=None, evaluations=None):
-    throughput = dataclasses.replace(
-        status.throughput, episodes_per_second=candidates, evaluation_episodes_per_second=evaluations
-    )
-    return dataclasses.replace(status, throughput=throughput)
-
-
-def rest(status, rate):
-    return [
-        (each.name, each.seconds, each.episodes) for each in estimate_eta(with_speed(status, evaluations=rate)).rest
-    ]
-
-
 @pytest.mark.parametrize("rate", [None, 0.5])
 def test_the_end_is_that_of_search_evaluation_and_confirmation(rate):
     each = STATUS.settings.evaluation_episodes
     before = status({"minutes": 2.0}, seconds=60.0, closing=90, evaluating=EpisodeProgress(0, 0))
-    judging = [
-        (name, rate and count / rate, count) for name, count in (("evaluation", each), ("confirmation", 90 - each))
-    ]
-    assert rest(before, rate) == [("search", 60.0, 0), *judging]
     eta = estimate_eta(with_speed(before, evaluations=rate))
+    parts = [("evaluation", each), ("confirmation", 90 - each)]
+    assert eta.rest == (Rest("search", 60.0), *(Rest(name, rate and count / rate, count) for name, count in parts))
     assert eta.seconds == (None if rate is None else 240.0)
     assert eta.share == pytest.approx(0.5 if rate is None else 60 / 300)
 
@@ -111,23 +96,13 @@ def test_once_its_limit_is_reached_a_run_is_not_at_its_end(rate):
         {"minutes": 1.0}, seconds=66.0, gone=40.0, state="evaluating", ending=True, closing=90,
         evaluating=EpisodeProgress(10, 16),
     )  # fmt: skip
-    assert rest(ending, rate) == [(name, rate and count / rate, count)
-                                  for name, count in (("evaluation", 6), ("confirmation", 84))]  # fmt: skip
     eta = estimate_eta(with_speed(ending, evaluations=rate))
+    parts = [("evaluation", 6), ("confirmation", 84)]
+    assert eta.rest == tuple(Rest(name, rate and count / rate, count) for name, count in parts)
     assert eta.share == pytest.approx(10 / 100 if rate is None else (66 + 20) / (66 + 20 + 180))
-    assert "of 1 minute" not in eta.description
-
-
-def test_a_limit_that_an_evaluation_reached_is_over_too():
-    eta = estimate_eta(
-        with_speed(status({"target": 900.0}, state="evaluating", ending=True, closing=90), evaluations=9.0)
-    )
-    assert eta.seconds == 10.0
-
-
-def test_a_run_whose_limit_is_not_reached_is_not_about_to_end():
-    quick = estimate_eta(status({"generations": 12}, paces=(0.1,)))
-    assert quick.seconds == pytest.approx(0.5)
+    assert eta.limits == ()
+    reached = status({"target": 900.0}, state="evaluating", ending=True, closing=90)  # by an evaluation
+    assert estimate_eta(with_speed(reached, evaluations=9.0)).seconds == 10.0
 
 
 def test_after_losing_workers_the_remaining_speed_counts():
@@ -145,22 +120,14 @@ def test_a_target_score_has_no_estimate():
     assert eta.seconds is None
 
 
-def test_without_limits_or_generations_there_is_no_estimate():
+def test_without_a_number_a_generation_or_a_worker_there_is_no_estimate():
     assert estimate_eta(status(paces=())).limits == ()
+    for strange in ("many", None, [1], float("nan"), -3):
+        limits = dict.fromkeys(("generations", "steps", "minutes", "target", "parted"), strange)
+        assert estimate_eta(status(limits, seconds=1.0)).limits == ()
     assert estimate_eta(status({"generations": 9}, paces=())).seconds is None
-
-
-@pytest.mark.parametrize("state", ["paused", "waiting for workers", "ended", "left"])
-def test_inactive_states_have_no_estimate(state):
-    assert estimate_eta(status({"minutes": 30.0}, seconds=60.0, state=state)).seconds is None
-
-
-@pytest.mark.parametrize("strange", ["many", None, [1], float("nan"), -3])
-def test_unknown_limits_are_ignored(strange):
-    eta = estimate_eta(
-        status(dict.fromkeys(("generations", "steps", "minutes", "target", "parted"), strange), seconds=1.0)
-    )
-    assert eta.limits == ()
+    for state in ("paused", "waiting for workers", "ended", "left"):
+        assert estimate_eta(status({"minutes": 30.0}, seconds=60.0, state=state)).seconds is None
 
 
 @pytest.mark.parametrize(
@@ -173,13 +140,7 @@ def test_unknown_limits_are_ignored(strange):
         ({"state": "evaluating", "confirming": EpisodeProgress(3, 1600)}, "3 of 1,600 episodes"),
         ({"state": "waiting for workers"}, "waiting for workers"),
         ({"state": "waiting for workers", "workers": WorkerCount(0, 0, 0), "steps": 0}, "waiting for workers"),
-        (
-            {
-                "state": "waiting for workers",
-                "worker_list": (dataclasses.replace(WORKER, state="left", reason="no memory"),),
-            },
-            f"{WORKER.worker} .*0.3 s .*no memory",
-        ),
+        ({"state": "waiting for workers", "worker_list": (LEFT,)}, f"{LEFT.worker} .*0.3 s .*no memory"),
         ({"state": "waiting for workers", "refused": {"old-host": "no AVX2"}}, "old-host .*no AVX2"),
         ({"state": "left"}, "--resume night"),
         ({"state": "ended", "why": "30 minutes", "best": None}, "ended: 30 minutes"),
@@ -190,12 +151,9 @@ def test_states_are_described(changes, named):
     assert re.search(named, LiveRunView.of_status(status(**changes)).state)
 
 
-@pytest.mark.parametrize(
-    ("seconds", "said"),
-    [
-        (0.0, "0 s"), (0.25, "0.25 s"), (4.6, "4.6 s"), (48.2, "48 s"), (59.7, "1 min"), (720, "12 min"),
-        (3599, "1 h"), (12_000, "3 h 20 min"), (439_200, "5 d 2 h"), (86_400 * 3, "3 d"), (float("inf"), "very long"),
-    ],
-)  # fmt: skip
-def test_durations_are_formatted(seconds, said):
-    assert format_duration(seconds) == said
+def test_durations_are_formatted():
+    said = {
+        0.0: "0 s", 0.25: "0.25 s", 4.6: "4.6 s", 48.2: "48 s", 59.7: "1 min", 720: "12 min", 3599: "1 h",
+        12_000: "3 h 20 min", 439_200: "5 d 2 h", 86_400 * 3: "3 d", float("inf"): "very long",
+    }  # fmt: skip
+    assert {seconds: format_duration(seconds) for seconds in said} == said

@@ -1,12 +1,15 @@
 """A lock file is a regular file whose content stays; anything else is refused in one line, at once.
-Tests common/runs/run_lock.py."""
+Tests regular_files.py and common/runs/run_lock.py."""
 
+import errno
 import os
+from io import BufferedReader
 
 import pytest
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.locks import folder_lock
+from dreamfleet.common.files.regular_files import _Readable
 from dreamfleet.common.runs.run_lock import is_run_locked, run_lock
 from dreamfleet.coordinator.addons.runs import backup
 from dreamfleet.coordinator.addons.spawn.agent import Channel, FailedError, HostFolder
@@ -24,30 +27,27 @@ def locked(request):
     return LOCKS[request.param]
 
 
-def test_a_link_is_not_followed(tmp_path, locked):
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, lambda lock: lock.symlink_to(lock.parents[1] / "own")])
+def test_a_pipe_a_folder_or_a_link_is_refused_at_once_and_what_a_lock_file_holds_stays(tmp_path, locked, make):
     hold, name = locked
-    own, folder = tmp_path / "own", tmp_path / "folder"
+    own, lock = tmp_path / "own", tmp_path / "folder" / name
     own.write_text("mine")
-    folder.mkdir()
-    (folder / name).symlink_to(own)
-    with pytest.raises((UsageError, FailedError)), hold(folder):
+    lock.parent.mkdir()
+    make(lock)
+    with pytest.raises((UsageError, FailedError)), hold(lock.parent):
         pass
-    assert own.read_text() == "mine"
+    assert not is_run_locked(lock.parent)
+    lock.rmdir() if lock.is_dir() else lock.unlink()
+    lock.hardlink_to(own)
+    with hold(lock.parent):
+        assert own.read_text() == "mine"
 
 
-@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
-def test_a_pipe_or_a_folder_is_refused_at_once(tmp_path, locked, make):
-    hold, name = locked
-    make(tmp_path / name)
-    with pytest.raises((UsageError, FailedError)), hold(tmp_path):
-        pass
-    assert not is_run_locked(tmp_path)
-
-
-def test_what_a_lock_file_holds_stays(tmp_path, locked):
-    hold, name = locked
-    other = tmp_path / "other"
-    other.write_text("mine")
-    (tmp_path / name).hardlink_to(other)
-    with hold(tmp_path):
-        assert other.read_text() == "mine"
+def test_a_regular_file_that_has_nothing_to_read_yet_is_an_error():
+    """As `/proc/kmsg`, which only root may read."""
+    read, write = os.pipe2(os.O_NONBLOCK)
+    with BufferedReader(_Readable(read)) as file:
+        for size in (-1, 10):
+            with pytest.raises(OSError, match=str(errno.EINVAL)):
+                file.read(size)
+    os.close(write)

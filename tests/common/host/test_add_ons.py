@@ -19,18 +19,16 @@ def test_each_that_is_registered_loads():
     points = entry_points(group="dreamfleet.addons")
     assert len(points) >= 6
     assert all(callable(add_on(point.name)) for point in points)
+    assert find_add_on("nothing of this name") is None
 
 
 @pytest.mark.parametrize("value", ["dreamfleet.nowhere.card:Card", "dreamfleet.worker.addons.gone:Card"])
 def test_one_whose_folder_is_gone_is_absent(value, registered):
     registered(value)
     assert find_add_on("card") is None
+
     with pytest.raises(UsageError):
         add_on("card")
-
-
-def test_one_that_nobody_registered_is_absent():
-    assert find_add_on("nothing of this name") is None
 
 
 def test_a_package_that_one_needs_is_named(registered, tmp_path, monkeypatch):

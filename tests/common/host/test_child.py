@@ -1,15 +1,12 @@
-"""One class for child processes: what they send, how they end, and what ends with them."""
-
 import os
 import queue
-import select
 import signal
 import sys
 
 import pytest
 
 from dreamfleet.common.host.child import CommandChild, FunctionChild
-from tests.support.processes import DEADLINE
+from tests.support.processes import DEADLINE, ends
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="Linux")
 DEAF = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); signal.pause()"
@@ -52,8 +49,7 @@ def test_what_left_its_session_and_parent_ends_with_the_child():
         assert group == child.pid
         assert child.memory > 0
     assert child.exit_code == -signal.SIGKILL
-    assert select.select([pidfd], [], [], DEADLINE)[0]
-    os.close(pidfd)
+    assert ends(pidfd)
 
 
 @pytest.mark.parametrize("is_own", [True, False])

@@ -1,17 +1,12 @@
-"""What child processes leave behind ends with them, and with the process that started them."""
-
 import os
-import select
 import signal
 import subprocess
 import sys
-from pathlib import Path
-from time import monotonic, sleep
 
 import pytest
 
 from dreamfleet.common.host.descendants import VARIABLE, Descendants
-from tests.support.processes import DEADLINE, environment
+from tests.support.processes import ends, environment
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="Linux")
 
@@ -27,10 +22,6 @@ DAEMON = (
     "    os._exit(0)\n"
     "os.wait()\n"
 )
-
-
-def ends(pidfd):
-    return bool(select.select([pidfd], [], [], DEADLINE)[0])
 
 
 def start_daemon(where, **more):
@@ -60,17 +51,11 @@ def test_what_clears_the_environment_meanwhile_is_no_error():
 
 def test_a_process_of_the_session_without_the_mark_ends():
     ours = Descendants()
+    script = "env -i /bin/sh -c 'echo $$; exec /bin/sleep 600' & wait"
     with ours.starting():
-        child = subprocess.Popen(
-            ["/bin/sh", "-c", "env -i /bin/sleep 600 & echo $!; wait"], stdout=subprocess.PIPE, text=True,
-            start_new_session=True,
-        )  # fmt: skip
+        child = subprocess.Popen(["/bin/sh", "-c", script], stdout=subprocess.PIPE, text=True, start_new_session=True)
     ours.add_session(child.pid)
-    pid = int(child.stdout.readline())
-    until = monotonic() + DEADLINE
-    while b"sleep" not in Path(f"/proc/{pid}/cmdline").read_bytes() and monotonic() < until:
-        sleep(0.01)
-    pidfd = os.pidfd_open(pid)
+    pidfd = os.pidfd_open(int(child.stdout.readline()))
     ours.kill()
     assert ends(pidfd)
     child.wait()

@@ -1,5 +1,3 @@
-"""What code of other packages does to a process while it runs there is undone."""
-
 import os
 import threading
 from pathlib import Path
@@ -20,19 +18,15 @@ def test_code_that_takes_long_is_named(monkeypatch):
     assert "making it" in lines[0]
 
 
-def test_inside_another_it_starts_no_second_guard():
-    with contained("outer"):
-        mark = os.environ[VARIABLE]
-        with contained("inner"):
-            assert os.environ[VARIABLE] == mark
-    assert VARIABLE not in os.environ
-
-
 def test_a_current_folder_that_is_gone_is_no_error(tmp_path, monkeypatch):
     gone = tmp_path / "gone"
     gone.mkdir()
     monkeypatch.chdir(gone)
     gone.rmdir()
     with contained("it"):
+        mark = os.environ[VARIABLE]
+        with contained("another inside"):
+            assert os.environ[VARIABLE] == mark, "it starts no second guard"
         os.chdir(tmp_path)
     assert Path.cwd() == tmp_path
+    assert VARIABLE not in os.environ

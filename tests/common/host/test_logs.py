@@ -1,5 +1,3 @@
-"""Logs as text and as JSON."""
-
 import json
 import logging
 import re
@@ -34,19 +32,15 @@ def test_text_is_the_default_format():
     assert last.endswith(" why")
 
 
-@pytest.fixture
-def formatter(monkeypatch):
-    monkeypatch.setattr(TextFormatter, "label", "")
-    return TextFormatter()
-
-
-def line(formatter, logger, created, level=logging.INFO):
-    record = logging.LogRecord(logger, level, "", 0, "generation %d", (3,), None)
+def line(formatter, logger, created):
+    record = logging.LogRecord(logger, logging.INFO, "", 0, "generation %d", (3,), None)
     record.created = created
     return formatter.format(record)
 
 
-def test_a_line_has_the_time_of_day_and_a_days_first_one_the_date(formatter):
+def test_a_line_has_the_time_of_day_and_a_days_first_one_the_date(monkeypatch):
+    monkeypatch.setattr(TextFormatter, "label", "")
+    formatter = TextFormatter()
     noon = datetime(2026, 11, 26, 12, 0, 5).timestamp()
     lines = [line(formatter, "dreamfleet.coordinator.service.run_log", noon + hours * 3600) for hours in (0, 1, 12, 13)]
     assert lines == [
@@ -57,20 +51,18 @@ def test_a_line_has_the_time_of_day_and_a_days_first_one_the_date(formatter):
     ]
 
 
-@pytest.mark.parametrize(
-    ("logger", "label", "speaker"),
-    [
-        ("dreamfleet.worker.service.slot", "", "worker"),
-        ("dreamfleet.worker.service.slot", "worker core-1", "worker core-1"),
-        ("dreamfleet.coordinator", "run night", "run night"),
-        ("dreamfleet.router", "run night", "router"),
-        ("matplotlib.font_manager", "run night", "matplotlib.font_manager"),
-        ("dreamfleet", "run night", "dreamfleet"),
-    ],
-)
-def test_processes_that_share_a_log_are_told_apart(logger, label, speaker, formatter):
-    label_logs(label)
-    assert line(formatter, logger, 0.0).endswith(f" {speaker}: generation 3")
+def test_processes_that_share_a_log_are_told_apart(monkeypatch):
+    monkeypatch.setattr(TextFormatter, "label", "")
+    assert line(TextFormatter(), "dreamfleet.worker.service.slot", 0.0).endswith(" worker: generation 3")
+    label_logs("worker core-1")
+    for logger, speaker in {
+        "dreamfleet.worker.service.slot": "worker core-1",
+        "dreamfleet.coordinator": "worker core-1",
+        "dreamfleet.router": "router",
+        "matplotlib.font_manager": "matplotlib.font_manager",
+        "dreamfleet": "dreamfleet",
+    }.items():
+        assert line(TextFormatter(), logger, 0.0).endswith(f" {speaker}: generation 3")
 
 
 @pytest.mark.parametrize("wanted", ["json", "auto"])

@@ -39,10 +39,6 @@ def hang(folder):
     time.sleep(600)
 
 
-def test_each_result_comes():
-    assert set(map_in_processes(2, begin, (), abs, [-1, 2, -3])) == {1, 2, 3}
-
-
 @pytest.mark.slow
 def test_a_crash_is_noticed_although_another_process_holds_the_pipes(tmp_path, monkeypatch):
     monkeypatch.setenv(rough_tasks.FOLDER, str(tmp_path))
@@ -53,9 +49,10 @@ def test_a_crash_is_noticed_although_another_process_holds_the_pipes(tmp_path, m
         time.sleep(0.01)
 
 
-def test_closed_early_it_waits_for_what_runs(tmp_path):
+def test_each_result_comes_and_closed_early_it_waits_for_what_runs(tmp_path):
+    assert set(map_in_processes(2, begin, (), abs, [-1, 2, -3])) == {1, 2, 3}
     results = map_in_processes(2, begin, (), write_later, [tmp_path / str(number) for number in range(20)])
-    next(results)
+    assert next(results) is None
     results.close()
     assert 2 <= len(list(tmp_path.iterdir())) < 20
 

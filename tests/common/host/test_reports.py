@@ -1,5 +1,3 @@
-"""What a verb reports to the program that started it."""
-
 import json
 import os
 import subprocess
@@ -27,30 +25,18 @@ def test_a_failure_is_reported_whatever_the_log_looks_like(tmp_path):
         (failure,) = child.reports(reports.FAILURE)
         assert child.last_line() == failure
         assert "absent" in failure
+        with pytest.raises(DreamfleetError, match=reports.ADDRESS):  # it ended: no endless wait
+            child.wait_for_report(reports.ADDRESS, DEADLINE)
 
 
-def test_a_verb_that_ends_without_the_awaited_report_is_no_endless_wait(tmp_path):
-    with (
-        VerbProcess("runs", "list", "--runs-dir", tmp_path) as child,
-        pytest.raises(DreamfleetError, match=reports.ADDRESS),
-    ):
-        child.wait_for_report(reports.ADDRESS, DEADLINE)
-
-
-def test_reports_reach_a_file_and_end_with_the_process_that_they_are_of(tmp_path):
+def test_reports_reach_a_file_and_end_with_the_process_and_a_place_that_is_not_there_costs_them_alone(tmp_path):
     path = tmp_path / "reports"
-    environment = {**os.environ, reports.VARIABLE: str(path)}
-    done = subprocess.run([sys.executable, "-c", REPORTING], env=environment, capture_output=True, check=True)
-    assert done.stdout == b"False\n", "what it starts reports nowhere"
+    for place in (path, "", "999", "/nowhere/at/all", "."):
+        environment = {**os.environ, reports.VARIABLE: str(place)}
+        done = subprocess.run([sys.executable, "-c", REPORTING], env=environment, capture_output=True, check=True)
+        assert (done.stdout, done.stderr) == (b"False\n", b""), "what it starts reports nowhere"
     assert list(map(json.loads, path.read_text().splitlines())) == [{"address": ["here", 7]}, {"failure": "é\n"}]
     assert path.stat().st_mode & 0o777 == 0o600
-
-
-@pytest.mark.parametrize("place", ["", "999", "/nowhere/at/all", "."])
-def test_a_place_that_is_not_there_costs_the_reports_alone(place):
-    environment = {**os.environ, reports.VARIABLE: place}
-    done = subprocess.run([sys.executable, "-c", REPORTING], env=environment, capture_output=True, check=True)
-    assert done.stderr == b""
 
 
 def test_what_is_no_report_is_passed_over():

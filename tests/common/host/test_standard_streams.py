@@ -1,5 +1,3 @@
-"""Streams with a slow reader, over real pipes."""
-
 import os
 import re
 import subprocess
@@ -33,20 +31,10 @@ def read_in_background(reader, until):
     return got, thread
 
 
-def test_output_arrives_in_order(pipe):
-    reader, stream = pipe
-    unblocked = NonblockingStream(stream)
-    for number in range(100):
-        print("line", number, file=unblocked)
-    print("and a half", end="", file=unblocked, flush=True)
-    got, thread = read_in_background(reader, b"half")
-    thread.join(DEADLINE)
-    assert got.decode() == "".join(f"line {number}\n" for number in range(100)) + "and a half"
-
-
 def test_a_slow_reader_blocks_nothing_and_drops_are_reported(pipe):
     reader, stream = pipe
     unblocked = NonblockingStream(stream)
+    print("and a half", end="", file=unblocked, flush=True)
     line = "x" * 999 + "\n"
     count = 3 * MAX_WAITING_CHARS // len(line)
     for _ in range(count):
@@ -54,6 +42,7 @@ def test_a_slow_reader_blocks_nothing_and_drops_are_reported(pipe):
     unblocked.finish(0.1)
     got, thread = read_in_background(reader, rb"[^x\n]\n")  # the end of the line that counts them
     thread.join(DEADLINE)
+    assert got.startswith(b"and a half")
     arrived = got.count(line.encode())
     dropped = int(re.search(rb"\b\d+\b", got)[0])
     assert arrived + dropped == count

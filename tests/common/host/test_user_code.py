@@ -1,21 +1,16 @@
-"""What a user's code sees of the command line, and what is said as it fails."""
+"""What a user's code sees of the command line, and what is said as it fails. Tests trusted_modules.py."""
 
 import json
 import subprocess
 import sys
+from functools import partial
 
 import pytest
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host import user_code as module
-from dreamfleet.common.host.trusted_modules import VARIABLE, import_trusted
-from dreamfleet.common.host.user_code import (
-    ARGUMENTS,
-    describe_error,
-    keep_user_arguments,
-    own_arguments,
-    user_code,
-)
+from dreamfleet.common.host.trusted_modules import VARIABLE, check_trusted, import_trusted
+from dreamfleet.common.host.user_code import ARGUMENTS, describe_error, keep_user_arguments, own_arguments, user_code
 from dreamfleet.common.protocol.tasks import load_task
 from dreamfleet.coordinator.optimisers.registry import _find
 from tests.support.processes import environment
@@ -64,22 +59,25 @@ def ours(monkeypatch, tmp_path):
     sys.modules.pop("parsing", None)
 
 
-@pytest.mark.parametrize(
-    "load",
-    [
-        lambda: import_trusted("parsing", "x"),
-        lambda: load_task("function:parsing:cost"),
-        lambda: _find("parsing:Search"),
-    ],
-)
-@pytest.mark.parametrize(("given", "seen"), [(None, ["parsing"]), (["tuning.py", "--target=3"], None)])
-def test_a_module_sees_the_arguments_of_its_program_else_its_name(ours, monkeypatch, load, given, seen):
+@pytest.mark.parametrize("given", [[], ["tuning.py", "--target=3"]])
+def test_a_module_sees_the_arguments_of_its_program_else_its_name(ours, monkeypatch, given):
     (ours / "parsing.py").write_text(PARSING.format(more=""))
     if given:
         monkeypatch.setenv(ARGUMENTS, json.dumps(given))
-    load()
-    assert (given or seen) == sys.modules["parsing"].SEEN
-    assert sys.argv == OURS
+    for load, name in ((partial(import_trusted, chooser="x"), "parsing"), (load_task, "function:parsing:cost"),
+                       (_find, "parsing:Search")):  # fmt: skip
+        sys.modules.pop("parsing", None)
+        load(name)
+        assert (given or ["parsing"]) == sys.modules["parsing"].SEEN
+        assert sys.argv == OURS
+
+
+@pytest.mark.parametrize("module", ["sqlite3.dbapi9", "no_such_module_of_mine", "no_such_package.inside"])
+def test_a_module_that_is_not_trusted_is_refused_with_each_remedy_that_is_needed(module, monkeypatch):
+    monkeypatch.delenv(VARIABLE, raising=False)
+    with pytest.raises(UsageError, match=f"--trust.* {VARIABLE}.*{module}") as caught:
+        check_trusted(module, "task 'mine'")
+    assert ("PYTHONPATH" in str(caught.value)) == module.startswith("no_such")
 
 
 def test_a_users_program_keeps_its_arguments_and_passes_them_on(monkeypatch, tmp_path):
@@ -97,13 +95,11 @@ def test_a_scoring_process_keeps_what_it_shows(ours, monkeypatch):
     monkeypatch.setenv(ARGUMENTS, '["tuning.py"]')
     keep_user_arguments()
     assert sys.argv == ["tuning.py"]
-    with user_code("tuning", "importing tuning"):
-        pass
-    assert sys.argv == ["tuning.py"]
-    monkeypatch.delenv(ARGUMENTS)
-    with user_code("tuning", "importing tuning"):
-        pass
-    assert sys.argv == ["tuning"]
+    for kept in (["tuning.py"], ["tuning"]):
+        with user_code("tuning", "importing tuning"):
+            pass
+        assert sys.argv == kept
+        monkeypatch.delenv(ARGUMENTS, raising=False)
 
 
 def test_what_a_module_printed_as_it_exits_is_in_the_error(ours):

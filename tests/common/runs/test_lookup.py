@@ -1,5 +1,3 @@
-"""Lookup by name: shipped artifacts before files."""
-
 import re
 
 import numpy as np
@@ -15,20 +13,11 @@ from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.storage.journal import Journal
 
 
-@pytest.fixture
-def subspace():
-    return Subspace(np.ones((2, 5), np.float32), np.zeros(2, np.float32), ("a", "b"), "ab" * 32)
-
-
-@pytest.mark.parametrize(
-    "path", sorted((pretrained_folder() / lookup.SUBSPACES).glob("*.npz")), ids=lambda path: path.stem
-)
-def test_a_shipped_subspace_belongs_to_a_shipped_world_model(path):
-    owner = find_bundle("tiny" if path.stem == "real" else path.stem)
-    assert find_subspace(path.stem).bundle == owner.sha256
-
-
-def test_a_subspace_is_a_shipped_one_or_a_file(subspace, tmp_path, monkeypatch):
+def test_a_subspace_is_a_shipped_one_of_a_shipped_world_model_or_a_file(tmp_path, monkeypatch):
+    for path in (pretrained_folder() / lookup.SUBSPACES).glob("*.npz"):
+        owner = find_bundle("tiny" if path.stem == "real" else path.stem)
+        assert find_subspace(path.stem).bundle == owner.sha256
+    subspace = Subspace(np.ones((2, 5), np.float32), np.zeros(2, np.float32), ("a", "b"), "ab" * 32)
     monkeypatch.setattr(lookup, "pretrained_folder", lambda: tmp_path / "ships")
     (tmp_path / "ships" / lookup.SUBSPACES).mkdir(parents=True)
     monkeypatch.chdir(tmp_path)

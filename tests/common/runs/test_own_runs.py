@@ -29,7 +29,8 @@ def ledger(tmp_path):
     return tmp_path / "state" / "dreamfleet" / "own-runs" / UID
 
 
-def test_a_run_begun_here_has_its_module_trusted_and_found(world, monkeypatch):
+def test_a_run_begun_here_has_its_module_trusted_and_found(world, monkeypatch, ledger):
+    assert json.loads(ledger.read_text()) == [TASK, OPTIONS, str(world)]
     monkeypatch.setattr("sys.path", [each for each in __import__("sys").path if each != str(world)])
     trust_own_run(UID, TASK, OPTIONS)
     assert is_trusted("my_world")
@@ -54,12 +55,6 @@ def test_no_file_chooses_a_module_by_naming_another_run_task_or_option(uid, task
     assert not is_trusted("my_world")
 
 
-def test_what_was_not_trusted_is_not_remembered(ledger):
-    ledger.unlink()
-    remember_run(UID, TASK, OPTIONS)
-    assert not ledger.exists()
-
-
 TEXTS = "5", "null", "[]", '["gym:my_world:Catch-v0"]', "[", "\x00", '["a", "b", "c", "d"]'
 
 
@@ -74,25 +69,24 @@ def test_a_ledger_that_is_damaged_or_that_others_may_write_trusts_nothing(harm, 
     assert not is_trusted("my_world")
 
 
-def test_a_folder_that_others_may_write_is_not_trusted(world, caplog):
+def test_a_module_in_a_folder_that_others_may_write_or_of_another_place_is_not_trusted(
+    world, tmp_path, monkeypatch, caplog
+):
     world.chmod(0o777)
     trust_own_run(UID, TASK, OPTIONS)
     assert not is_trusted("my_world")
     assert "--trust" in caplog.text
-
-
-def test_a_module_of_another_place_is_not_trusted(tmp_path, monkeypatch):
+    world.chmod(0o700)
     (tmp_path / "my_world.py").write_text("")
     monkeypatch.syspath_prepend(tmp_path)
     trust_own_run(UID, TASK, OPTIONS)
     assert not is_trusted("my_world")
 
 
-def test_the_ledger_is_json_of_task_options_and_folder(ledger, world):
-    assert json.loads(ledger.read_text()) == [TASK, OPTIONS, str(world)]
-
-
-def test_a_state_folder_that_cannot_be_written_is_a_warning(tmp_path, monkeypatch, caplog):
+def test_what_is_not_trusted_or_cannot_be_written_is_not_remembered(tmp_path, monkeypatch, caplog, ledger):
+    ledger.unlink()
+    remember_run(UID, TASK, OPTIONS)
+    assert not ledger.exists()
     (tmp_path / "taken").write_text("a file")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "taken"))
     trust(["my_world"])

@@ -17,8 +17,8 @@ def scheduled(*stages):
     return replace(PLAIN, stages=stages)
 
 
-def history(*steps):
-    return [StoredGeneration(number, 1.0, 0.1, 1.2, 0.8, 0.1, each, 1.0) for number, each in enumerate(steps)]
+def history(count):
+    return [StoredGeneration(number, 1.0, 0.1, 1.2, 0.8, 0.1, 10, 1.0) for number in range(count)]
 
 
 def evaluated(means):
@@ -47,6 +47,9 @@ def test_another_population_or_step_size_starts_a_new_search():
     assert [each.starts_new_search for each in second] == [True, True, False, False]
     stages = stages_of(scheduled(StageSettings(1), StageSettings(1, sigma0=0.2), StageSettings(horizon=5)))
     assert [each.search for each in stages] == [1, 2, 2], "a continued search is of the stage that started it"
+    restarted = stages_of(scheduled(*RESTARTED))
+    assert [each.search for each in restarted] == [1, 2, 3, 3]
+    assert " 0.1" in restarted[2].description
 
 
 @pytest.mark.parametrize(
@@ -59,14 +62,14 @@ def test_another_population_or_step_size_starts_a_new_search():
     ],
 )
 def test_a_stage_ends_after_its_own_generations_or_steps_or_by_a_score(stages, means, found):
-    assert numbers(scheduled(*stages), history(*[10] * 8), evaluated(means)) == found
+    assert numbers(scheduled(*stages), history(8), evaluated(means)) == found
 
 
 def test_scores_of_earlier_stages_or_unscheduled_evaluations_end_no_stage():
     settings = scheduled(StageSettings(4), StageSettings(score=50.0), StageSettings(horizon=50))
     stray = evaluated({1: 90.0, 3: 90.0, 4: 90.0, 5: 10.0, 6: 90.0})
-    assert numbers(settings, history(*[10] * 9), stray) == [1] * 4 + [2] * 6
-    assert numbers(settings, history(*[10] * 9), [*stray[:3], *evaluated({5: 50.0})]) == [1] * 4 + [2] * 4 + [3] * 2
+    assert numbers(settings, history(9), stray) == [1] * 4 + [2] * 6
+    assert numbers(settings, history(9), [*stray[:3], *evaluated({5: 50.0})]) == [1] * 4 + [2] * 4 + [3] * 2
 
 
 RESTARTED = (
@@ -86,8 +89,8 @@ RESTARTED = (
 )
 def test_a_search_that_does_not_reach_its_score_is_restarted_and_one_that_does_is_not(means, stages):
     settings = scheduled(*RESTARTED)
-    assert numbers(settings, history(*[10] * 12), evaluated(means)) == stages
-    found = begun_stages(settings, history(*[10] * 12), evaluated(means))
+    assert numbers(settings, history(12), evaluated(means)) == stages
+    found = begun_stages(settings, history(12), evaluated(means))
     assert [each.stage.number for each in found] == sorted(set(stages))
     shown = describe_stages(settings, found)
     assert [name for name, text in shown.items() if text == "left out"] == [
@@ -108,27 +111,21 @@ def test_a_search_that_does_not_reach_its_score_is_restarted_and_one_that_does_i
 )
 def test_a_new_search_after_restarts_begins_at_the_best_mean_of_them_all(means, origin):
     for last, expected in ((StageSettings(sigma0=0.2), origin), (StageSettings(horizon=50), None)):
-        found = begun_stages(scheduled(*RESTARTED[:-1], last), history(*[10] * 12), evaluated(means))
+        found = begun_stages(scheduled(*RESTARTED[:-1], last), history(12), evaluated(means))
         assert [each.origin for each in found] == [None] * (len(found) - 1) + [expected]
         assert found[-1].beginning.endswith("" if expected is None else f" from {origin}'s mean")
     last = [replace(RESTARTED[2], score=None), StageSettings(sigma0=0.2)]  # the last restart needs no score
-    found = begun_stages(scheduled(*RESTARTED[:2], *last), history(*[10] * 12), evaluated({**means, 9: 30.0}))
+    found = begun_stages(scheduled(*RESTARTED[:2], *last), history(12), evaluated({**means, 9: 30.0}))
     assert found[-1].origin == (9 if max(means.values(), default=0) < 30 else origin)
     plain = [replace(each, restart=False, sigma0=0.2) for each in RESTARTED]
-    assert {each.origin for each in begun_stages(scheduled(*plain), history(*[10] * 12), evaluated(means))} == {None}
-
-
-def test_a_restart_is_a_search_of_its_own():
-    stages = stages_of(scheduled(*RESTARTED))
-    assert [each.search for each in stages] == [1, 2, 3, 3]
-    assert " 0.1" in stages[2].description
+    assert {each.origin for each in begun_stages(scheduled(*plain), history(12), evaluated(means))} == {None}
 
 
 def test_later_evaluations_and_their_order_do_not_matter():
     settings = scheduled(StageSettings(score=50.0), StageSettings(horizon=50))
     for order in itertools.permutations(evaluated({1: 10.0, 3: 50.0, 5: 90.0, 7: 0.0})):
-        assert stage_at(5, settings, history(*[10] * 9), order).stage.number == 1
-        assert stage_at(6, settings, history(*[10] * 9), order).since == 6
+        assert stage_at(5, settings, history(9), order).stage.number == 1
+        assert stage_at(6, settings, history(9), order).since == 6
 
 
 @pytest.mark.parametrize(
@@ -139,41 +136,35 @@ def test_later_evaluations_and_their_order_do_not_matter():
 def test_a_generation_requires_an_evaluation_only_if_a_score_may_end_its_stage(end, required_evaluation):
     agenda, found = StageTracker(scheduled(end, StageSettings())), []
     for number in range(8):
-        agenda.advance_to(number, history(*[10] * number), {})
+        agenda.advance_to(number, history(number), {})
         found.append(agenda.required_evaluation(number + 1))
     assert found == required_evaluation
 
 
 def test_stages_and_their_reasons_are_described():
     settings = scheduled(StageSettings(2), StageSettings(steps=15), StageSettings(score=50.0), StageSettings())
-    begun = begun_stages(settings, history(*[10] * 9), evaluated({5: 51.25}))
+    begun = begun_stages(settings, history(9), evaluated({5: 51.25}))
     assert [each.since for each in begun] == [0, 2, 4, 8]
     assert begun[0].why == ""
     assert "20" in begun[2].why
     assert "51.25" in begun[3].why
 
 
-def test_candidates_are_scored_with_their_stage_and_temperature():
-    warm = replace(PLAIN, task=replace(SPEC, temperature=1.0))
-    settings = replace(warm, stages=(StageSettings(4), StageSettings(horizon=50, patience=0)))
-    spec = stage_at(6, settings, history(*[10] * 6), ()).stage.settings.task
-    assert spec == replace(SPEC, horizon=50, patience=0, temperature=1.0)
-
-
 def test_settings_and_digests_without_a_schedule_are_unchanged():
     assert '"stages"' not in PLAIN.to_json()
-    assert stage_at(5, PLAIN, history(*[10] * 5), ()).stage.settings.task == SPEC
+    assert stage_at(5, PLAIN, history(5), ()).stage.settings.task == SPEC
     written = "32b5b1f8a6bee0b22ed62a5034cdf1657709a3c7b15707ad38a792110c7c9de4"
     assert SPEC.with_overrides(horizon=SPEC.horizon).digest("score", b"x" * 32, (1,)).hex() == written
-
-
-def test_a_schedule_is_stored_without_unchanged_settings():
     settings = scheduled(StageSettings(3, score=5.0), StageSettings(horizon=400, racing=False))
     assert RunSettings.from_json(settings.to_json()) == settings
     assert '"stages": [{"generations": 3, "score": 5.0}, {"horizon": 400, "racing": false}]' in settings.to_json()
 
 
 def test_jobs_are_named_by_vector_seed_and_the_specification_of_their_episode():
+    warm = replace(PLAIN, task=replace(SPEC, temperature=1.0))
+    settings = replace(warm, stages=(StageSettings(4), StageSettings(horizon=50, patience=0)))
+    spec = stage_at(6, settings, history(6), ()).stage.settings.task
+    assert spec == replace(SPEC, horizon=50, patience=0, temperature=1.0)
     dreams = replace(PLAIN, task=replace(SPEC, task="dream", temperature=1.0), driven=0.5)
     (stage,) = stages_of(dreams)
     specs = [stage.episode_spec(episode) for episode in range(2)]

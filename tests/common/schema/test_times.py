@@ -1,5 +1,3 @@
-"""Times in journals that no clock should have given: read as unknown, and in no way an error."""
-
 import shutil
 import sqlite3
 from contextlib import closing
@@ -15,27 +13,19 @@ RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
 ENDED = "2026-01-01T00:00:00+00:00"
 
 
-@pytest.mark.parametrize(
-    ("begun", "seconds"),
-    [
-        ("2025-12-31T23:59:00+00:00", 60.0),
-        ("2026-01-01T01:59:00+02:00", 60.0),
-        ("2026-01-02T00:00:00+00:00", None),  # the clock was set back
-        ("9999-12-31T23:59:59-23:00", None),
-        ("", None),
-        ("yesterday", None),
-    ],
-)
-def test_seconds_between_two_moments(begun, seconds):
-    assert elapsed_seconds(begun, ENDED) == seconds
+def test_seconds_between_two_moments():
+    for begun in ("2025-12-31T23:59:00+00:00", "2026-01-01T01:59:00+02:00"):
+        assert elapsed_seconds(begun, ENDED) == 60.0
+    set_back = "2026-01-02T00:00:00+00:00"
+    for begun in (set_back, "9999-12-31T23:59:59-23:00", "", "yesterday"):
+        assert elapsed_seconds(begun, ENDED) is None
     assert elapsed_seconds(ENDED, "") is None
 
 
 def test_a_moment_for_people():
     assert format_time("2026-11-23T19:30:59+02:00") == "2026-11-23 17:30 UTC"
-    assert [format_time(each) for each in ("", "x\x1b", "9999-12-31T23:59:59-23:00")] == [
-        "", "x\\x1b", "9999-12-31T23:59:59-23:00",
-    ]  # fmt: skip
+    odd = {"": "", "x\x1b": "x\\x1b", "9999-12-31T23:59:59-23:00": "9999-12-31T23:59:59-23:00"}
+    assert [format_time(each) for each in odd] == [*odd.values()]
 
 
 @pytest.mark.parametrize("begun", [None, "", "x", "1970-01-01T00:00:00", "9999-12-31T23:59:59-23:00"])

@@ -1,5 +1,3 @@
-"""A secured router's port, and strangers whose connections stay unauthenticated."""
-
 import logging
 import socket
 import sys
@@ -32,28 +30,20 @@ def test_many_unauthenticated_connections_delay_only_new_ones(tmp_path, caplog):
     endpoint = f"tls/127.0.0.1:{port}"
     viewer = Network(connect=(endpoint,), credentials=read_join_file(tmp_path / "eye.join"))
     caplog.set_level(logging.WARNING, "dreamfleet.router")
-    with open_session(Network(listen=(endpoint,), credentials=read_join_file(tmp_path / "home.join"))) as router:
+    home = Network(listen=(endpoint,), credentials=read_join_file(tmp_path / "home.join"))
+    with open_session(home) as router:
         with open_session(viewer):
             inside = router.info.transports()
             knock(port, 2 * MAX_UNAUTHENTICATED)
-            until(
-                lambda: "crowd" in [getattr(each, "facts", {}).get("event") for each in caplog.records],
-                "a crowd goes unnoticed",
-            )
+            until(lambda: "crowd" in [getattr(each, "facts", {}).get("event") for each in caplog.records], "no crowd")
             assert [each.zid for each in router.info.transports()] == [each.zid for each in inside]
         until(lambda: joined(viewer), "a newcomer is not let in")
-        with (
-            ExitStack() as fleet,
-            ThreadPoolExecutor(2 * MAX_UNAUTHENTICATED) as threads,
-        ):  # who proves something is no crowd
-            for session in threads.map(
-                lambda _: open_session(viewer, timeout=DEADLINE), range(2 * MAX_UNAUTHENTICATED)
-            ):
+        many = 2 * MAX_UNAUTHENTICATED  # who proves something is no crowd
+        with ExitStack() as fleet, ThreadPoolExecutor(many) as threads:
+            for session in threads.map(lambda _: open_session(viewer, timeout=DEADLINE), range(many)):
                 fleet.enter_context(session)
             assert joined(viewer)
-    open_session(
-        Network(listen=(endpoint,), credentials=read_join_file(tmp_path / "home.join"))
-    ).close()  # its port is free
+    open_session(home).close()  # its port is free
 
 
 def joined(network):

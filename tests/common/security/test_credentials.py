@@ -49,17 +49,17 @@ def join(access, tmp_path):
     return path
 
 
-def test_an_authoritys_files_are_private(access):
-    assert stat.S_IMODE(access._folder.stat().st_mode) == 0o700
-    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in access._folder.iterdir() if path.name != "lock"}
-    assert modes == dict.fromkeys(("ca.pem", "ca.key", "issued.json", "box.join"), 0o600)
-
-
-def test_a_join_file_identifies_its_holder_and_repr_hides_secrets(join):
+def test_an_authoritys_files_are_private_and_a_join_file_identifies_its_holder(access, join):
     found = read_join_file(join)
     assert (found.role, found.name, found.connect, found.identity) == ("worker", "box", tuple(HERE), "worker.1")
     assert "PRIVATE KEY" in found.key
     assert "BEGIN" not in repr(found)
+    assert add_seat_to_name("gpu", found) == "gpu.1"
+    assert add_seat_to_name("x" * 63, found) == "x" * 61 + ".1"
+    assert worker_seat_identity("gpu.1/0badc0de") == "worker.1"
+    assert stat.S_IMODE(access._folder.stat().st_mode) == 0o700
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in access._folder.iterdir() if path.name != "lock"}
+    assert modes == dict.fromkeys(("ca.pem", "ca.key", "issued.json", "box.join"), 0o600)
 
 
 @pytest.mark.parametrize(
@@ -68,17 +68,14 @@ def test_a_join_file_identifies_its_holder_and_repr_hides_secrets(join):
         lambda text: "",
         lambda text: "not = [toml",
         lambda text: text + "#" * MAX_BYTES,
-        lambda text: text.replace("version = 1", "version = 2"),
-        lambda text: text.replace('role = "worker"', 'role = "king"'),
-        lambda text: text.replace("seat = 1", "seat = 0"),
-        lambda text: text.replace("seat = 1", 'seat = "1"'),
-        lambda text: text.replace("Z\nconnect", "\nconnect"),
-        lambda text: text.replace("name =", "nom ="),
         lambda text: text + 'more = "x"\n',
-        lambda text: text.replace('["tls/127.0.0.1:7447"]', "[1]"),
         lambda text: text.partition("certificate =")[0],
+        *((lambda text, old=old, new=new: text.replace(old, new)) for old, new in (
+            ("version = 1", "version = 2"), ('role = "worker"', 'role = "king"'), ("seat = 1", "seat = 0"),
+            ("seat = 1", 'seat = "1"'), ("Z\nconnect", "\nconnect"), ("name =", "nom ="),
+            ('["tls/127.0.0.1:7447"]', "[1]"))),
     ],
-)
+)  # fmt: skip
 def test_an_invalid_join_file_is_an_error_that_names_it_without_its_secret(join, damage):
     join.write_text(damage(join.read_text()))
     with pytest.raises(AccessError, match=re.escape(str(join))) as refused:
@@ -96,12 +93,6 @@ def test_a_readable_expired_or_invalid_join_file_is_refused(access, join, tmp_pa
         join.chmod(mode)
         with pytest.raises(AccessError, match="600"):
             read_join_file(join)
-
-
-def test_a_workers_name_ends_in_its_seat(join):
-    assert add_seat_to_name("gpu", read_join_file(join)) == "gpu.1"
-    assert add_seat_to_name("x" * 63, read_join_file(join)) == "x" * 61 + ".1"
-    assert worker_seat_identity("gpu.1/0badc0de") == "worker.1"
 
 
 def test_a_name_keeps_its_seat_until_revoked_and_seats_are_not_reused(access, tmp_path):
@@ -126,21 +117,25 @@ def revoked(access, tmp_path):
     return folder
 
 
-def test_the_watcher_sees_revocations_and_keeps_them_if_the_ledger_is_damaged(access, join, revoked, tmp_path):
-    folder = tmp_path / "carried"
-    watched = RevocationWatcher(folder, read_join_file(join))
+def test_a_revocation_is_seen_and_final_whatever_becomes_of_the_ledger(access, join, revoked, tmp_path):
+    folder, own = tmp_path / "carried", read_join_file(join)
+    ledger, older = folder / LEDGER_FILE, access._folder / LEDGER_FILE
+    watched = RevocationWatcher(folder, own)
     assert not watched.revoked_seats
     revoked.rename(folder)
-    watched.reload_if_changed(10.0)
+    for now, harm in enumerate((lambda: None, lambda: ledger.write_text("{"), lambda: shutil.copy(older, ledger))):
+        harm()
+        watched.reload_if_changed(10.0 * now)
+        assert "worker.1" in watched.revoked_seats
+    ledger.unlink()
+    watched.reload_if_changed(30.0)
     assert "worker.1" in watched.revoked_seats
-    (folder / LEDGER_FILE).write_text("{")
-    watched.reload_if_changed(20.0)
-    assert "worker.1" in watched.revoked_seats
+    ledger.write_text("{")
     with pytest.raises(AccessError, match=LEDGER_FILE):  # who begins with it would let everybody in
-        RevocationWatcher(folder, read_join_file(join))
-    replace(CertificateLedger.load(access._folder / LEDGER_FILE), authority="0" * 64).save(folder / LEDGER_FILE)
+        RevocationWatcher(folder, own)
+    replace(CertificateLedger.load(older), authority="0" * 64).save(ledger)
     with pytest.raises(AccessError, match="--access-dir"):
-        RevocationWatcher(folder, read_join_file(join))
+        RevocationWatcher(folder, own)
 
 
 def test_what_is_known_to_be_revoked_stays_so_without_its_ledger_and_with_an_older_one(access, join, tmp_path):
@@ -154,27 +149,12 @@ def test_what_is_known_to_be_revoked_stays_so_without_its_ledger_and_with_an_old
     assert RevocationWatcher(tmp_path, None, seats).authority == ""
 
 
-def test_a_ledger_that_is_replaced_or_removed_takes_no_revocation_back(access, join, revoked):
-    watched = RevocationWatcher(revoked, replace(read_join_file(join), seat=2))
-    (revoked / LEDGER_FILE).write_bytes((access._folder / LEDGER_FILE).read_bytes())
-    watched.reload_if_changed(float("inf"))
-    assert "worker.1" in watched.revoked_seats
-    (revoked / LEDGER_FILE).unlink()
-    watched._next = float("-inf")
-    watched.reload_if_changed(0.0)
-    assert "worker.1" in watched.revoked_seats
-
-
 def test_a_ledger_that_could_not_be_read_is_read_later_and_warned_of_once(access, join, revoked, monkeypatch, caplog):
     watched = RevocationWatcher(access._folder, replace(read_join_file(join), seat=2))
     watched._path, watched._next = revoked / LEDGER_FILE, float("-inf")
     caplog.clear()  # of what other tests revoked
-
-    def refused(path, most):
-        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
-
     with monkeypatch.context() as patched:
-        patched.setattr(certificate_ledger, "read_regular", refused)
+        patched.setattr(certificate_ledger, "read_regular", failing(errno.EMFILE))
         for now in (10.0, 20.0, 30.0):
             watched.reload_if_changed(now)
     assert "worker.1" not in watched.revoked_seats
@@ -197,46 +177,32 @@ def test_a_program_whose_own_file_is_revoked_or_over_goes_no_further(access, joi
 
 
 def test_the_verbs_create_list_and_revoke(tmp_path, capsys):
-    folder = ("--access-dir", str(tmp_path / "access"))
     out = tmp_path / "w.join"
-    assert main(["access", "init", *folder]) == 0
-    assert main(["access", "issue", "worker", "w1", *folder, "--connect", *HERE, "--out", str(out)]) == 0
+
+    def access(*words):
+        return main(["access", *words, "--access-dir", str(tmp_path / "access")])
+
+    assert access("init") == 0
+    assert access("issue", "worker", "w1", "--connect", *HERE, "--out", str(out)) == 0
     assert read_join_file(out).name == "w1"
-    assert main(["access", "revoke", "w1", *folder]) == 0
+    assert access("revoke", "w1") == 0
     said = capsys.readouterr().out
-    assert main(["access", "list", *folder, "--json"]) == 0
+    assert access("list", "--json") == 0
     (row,) = json.loads(listed := capsys.readouterr().out)
     assert (row["name"], row["workers"], row["state"]) == ("w1", "*.1", "revoked")
     assert "BEGIN" not in said + listed
-    assert main(["access", "init", *folder]) == 2
-    assert main(["access", "issue", "worker", "w2", *folder, "--connect", "tcp/h:1", "--out", f"{out}2"]) == 2
-    assert main(["access", "issue", "coordinator", "c", *folder, "--out", f"{out}2"]) == 2
+    assert access("init") == 2
     assert main(["pause", "--join", str(out)]) == 1
     assert "operator" in capsys.readouterr().err
-
-
-def test_a_listener_is_issued_a_file_for_its_host_names(tmp_path, capsys):
-    """The first of the five commands in docs/how-to/security.md."""
-    folder, out = ("--access-dir", str(tmp_path / "access")), tmp_path / "home.join"
-    assert main(["access", "init", *folder]) == 0
-    assert main(["access", "issue", "coordinator", "home", *folder, "--host", "h.example", "--out", str(out)]) == 0
-    assert (read_join_file(out).role, read_join_file(out).connect) == ("coordinator", ())
-    for wrong in ("h.example:7447", "tls/h.example", "", "a b", "a..b"):
-        assert main(["access", "issue", "coordinator", "c", *folder, "--host", wrong, "--out", f"{out}2"]) == 2
+    assert access("issue", "coordinator", "c", "--out", f"{out}2") == 2
+    for endpoint in ("tcp/h:1", "tls/[::1]:1"):
+        assert access("issue", "worker", "w2", "--connect", endpoint, "--out", f"{out}2") == 2
+        assert endpoint in capsys.readouterr().err
+    for host in ("h.example:7447", "tls/h.example", "", "a b", "a..b"):
+        assert access("issue", "coordinator", "c", "--host", host, "--out", f"{out}2") == 2
         assert "--host" in capsys.readouterr().err
-    assert main(["access", "issue", "worker", "w", *folder, "--connect", "tls/[::1]:1", "--out", f"{out}2"]) == 2
-    assert "tls/[::1]:1" in capsys.readouterr().err
-
-
-def test_a_full_disk_changes_nothing(access, monkeypatch):
-    def full(*_):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    before = (access._folder / LEDGER_FILE).read_bytes()
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(AccessError, match="No space left on device"):
-        access.revoke("box")
-    assert (access._folder / LEDGER_FILE).read_bytes() == before
+    assert access("issue", "coordinator", "home", "--host", "h.example", "--out", f"{out}2") == 0
+    assert (read_join_file(f"{out}2").role, read_join_file(f"{out}2").connect) == ("coordinator", ())
 
 
 def test_an_authority_with_foreign_parts_issues_nothing(tmp_path):
@@ -265,13 +231,21 @@ def test_an_authority_with_foreign_parts_issues_nothing(tmp_path):
     assert read_join_file(tmp_path / "home").secret == (whole / "secret").read_text().strip()
 
 
-def test_an_unreadable_folder_is_an_error(access, join, tmp_path, monkeypatch):
-    credentials = read_join_file(join)
+def failing(number):
+    def fail(*_, **__):
+        raise OSError(number, os.strerror(number))
 
-    def refused(self, **_):
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
+    return fail
 
-    monkeypatch.setattr(Path, "stat", refused)
+
+def test_a_full_disk_changes_nothing_and_an_unreadable_folder_is_an_error(access, join, tmp_path, monkeypatch):
+    credentials, before = read_join_file(join), (access._folder / LEDGER_FILE).read_bytes()
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", failing(errno.ENOSPC))
+        with pytest.raises(AccessError, match="No space left on device"):
+            access.revoke("box")
+    assert (access._folder / LEDGER_FILE).read_bytes() == before
+    monkeypatch.setattr(Path, "stat", failing(errno.EACCES))
     for looked in (
         lambda: Authority(tmp_path),
         lambda: Authority.create(tmp_path),

@@ -1,26 +1,27 @@
+"""Tests network.py."""
+
 import re
 import socket
 import time
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event
 
 import pytest
 
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
-from dreamfleet.common.transport.network import with_interface_index
+from dreamfleet.common.transport.network import wait_for_listener, with_interface_index
 from dreamfleet.common.transport.session import Network, check_clock, check_endpoint, open_session
 from tests.support.processes import DEADLINE, free_port
 
 
-@pytest.mark.parametrize(
-    "endpoint", ["tcp/127.0.0.1:7447", "tls/host.example:1", "tcp/[::1]:7447", "tcp/[fe80::1%lo]:7447"]
-)
-def test_good_endpoints(endpoint):
-    assert check_endpoint(endpoint) == endpoint
-
-
-@pytest.mark.parametrize("endpoint", ["", "127.0.0.1:7447", "tcp/host", "tcp/host:99999", "tcp/ host:1", "ftp/host:21"])
-def test_bad_endpoints_are_refused(endpoint):
-    with pytest.raises(UsageError, match=re.escape(repr(endpoint))):
-        Network(listen=(endpoint,))
+def test_bad_endpoints_are_refused():
+    for endpoint in ("tcp/127.0.0.1:7447", "tls/host.example:1", "tcp/[::1]:7447", "tcp/[fe80::1%lo]:7447"):
+        assert check_endpoint(endpoint) == endpoint
+    for endpoint in ("", "127.0.0.1:7447", "tcp/host", "tcp/host:99999", "tcp/ host:1", "ftp/host:21"):
+        with pytest.raises(UsageError, match=re.escape(repr(endpoint))):
+            Network(listen=(endpoint,))
+    with pytest.raises(UsageError, match=r"quic/host\.example:7447.*--join"):
+        check_endpoint("quic/host.example:7447")
 
 
 def test_a_link_local_address_has_its_interfaces_index_for_zenoh():
@@ -36,20 +37,10 @@ def test_a_link_local_address_has_its_interfaces_index_for_zenoh():
             open_session(network, timeout=0.2)
 
 
-def test_quic_is_refused_with_the_forms_that_work():
-    with pytest.raises(UsageError) as refused:
-        check_endpoint("quic/host.example:7447")
-    assert "quic/host.example:7447" in str(refused.value)
-    assert "--join" in str(refused.value)
-
-
-def test_a_port_in_use_is_an_error():
+def test_a_port_in_use_and_an_address_without_a_listener_are_errors():
     network = Network(listen=(f"tcp/127.0.0.1:{free_port()}",))
     with open_session(network), pytest.raises(ConnectionFailedError, match="--listen"):
         open_session(network)
-
-
-def test_no_listener_is_an_error():
     with pytest.raises(ConnectionFailedError, match="--connect"):
         open_session(Network(connect=(f"tcp/127.0.0.1:{free_port()}",)), timeout=0.2)
 
@@ -97,3 +88,22 @@ def test_a_clock_that_zenoh_cannot_write_is_an_error_that_says_so(seconds):
     with pytest.raises(DreamfleetError, match=f"{seconds:.0f}"):
         check_clock(seconds)
     check_clock(2.0**32 - 1)
+
+
+def test_a_listener_that_comes_later_is_noticed():
+    asked = Event()
+    with socket.socket() as listener, ThreadPoolExecutor() as pool:
+        listener.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{listener.getsockname()[1]}"
+        found = pool.submit(wait_for_listener, (endpoint,), DEADLINE, asked.set)  # `set` returns None: go on
+        assert asked.wait(DEADLINE)  # it looked in vain
+        listener.listen()
+        assert found.result(DEADLINE)
+        assert wait_for_listener((endpoint,), 0.0, lambda: True)
+
+
+def test_the_wait_ends_with_its_time_when_it_is_stopped_and_at_once_for_another_host_or_protocol():
+    assert not wait_for_listener(("tcp/127.0.0.1:1",), 0.0, lambda: False)
+    assert not wait_for_listener(("tcp/127.0.0.1:1",), DEADLINE, lambda: True)
+    for others in (("tcp/192.0.2.1:1",), ("tcp/127.0.0.1:1", "tcp/192.0.2.1:1"), ("udp/127.0.0.1:1",)):
+        assert wait_for_listener(others, DEADLINE, lambda: False)
