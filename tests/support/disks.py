@@ -1,6 +1,7 @@
-"""Small disks that a test can fill, if this process may mount them."""
+"""Small disks that a test can fill, if this process may mount them, and files that may not grow."""
 
 import os
+import resource
 import subprocess
 from contextlib import contextmanager
 
@@ -48,6 +49,16 @@ def small_disk(path, megabytes):
         yield disk
     finally:
         disk.remove()
+
+
+@contextmanager
+def file_size_limit():
+    """A function that limits the bytes of each file of this process until the end, as a full disk does."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @contextmanager

@@ -145,13 +145,6 @@ class Unseen(Observing):
         return np.zeros(2, np.float32)
 
 
-class Glass(Unseen):
-    """Draws floats from 0 to 1 with opacity."""
-
-    def render(self):
-        return np.dstack([super().render() / 255, np.full((HEIGHT, WIDTH), 0.5)])
-
-
 class Board(Unseen):
     """Observes a table of codes."""
 
@@ -277,8 +270,8 @@ class Rude(Dodge):
 
 
 KINDS = (
-    Faulty, Rude, InDict, InTwo, Grey, ChannelsFirst, Stacked, Floats, Buttons, Switches, BothEnds, Unseen, Glass,
-    Board, Gauges, Telling, Mute, Blind,
+    Faulty, Rude, InDict, InTwo, Grey, ChannelsFirst, Stacked, Floats, Buttons, Switches, BothEnds, Unseen, Board,
+    Gauges, Telling, Mute, Blind,
 )  # fmt: skip
 for each in KINDS:
     gymnasium.register(f"{each.__name__}-v0", each, max_episode_steps=200)

@@ -16,12 +16,12 @@ from dreamfleet.worker.tasks.api import Continuous, Score, Task, World
 MODULE = "tests.support.tasks"
 (
     TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, CHATTY, PAINTED, ROUNDED,
-    SECOND_TOY, BRITTLE, FRAGILE, EXPLODING,
+    SECOND_TOY, BRITTLE, EXPLODING,
 ) = (
     f"{MODULE}:{name}"
     for name in (
         "Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Silent", "Judged", "Counted", "Heavy", "Chatty",
-        "Painted", "Rounded", "SecondToy", "Brittle", "Fragile", "Exploding",
+        "Painted", "Rounded", "SecondToy", "Brittle", "Exploding",
     )
 )  # fmt: skip
 ALL = TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, PAINTED
@@ -117,22 +117,6 @@ class BrittleEnvironment(ToyEnvironment):
         if self._left == 7 and (self._is_barred or word < 26):
             raise ArithmeticError(f"the world of {id(self)} is brittle")
         return super().step(action)
-
-
-class Fragile(Toy):
-    """The episode of seed 6 takes its process with it."""
-
-    name = FRAGILE
-
-    def make_environment(self, assignment):
-        return FragileEnvironment()
-
-
-class FragileEnvironment(ToyEnvironment):
-    def reset(self, *, seed=None, options=None):
-        if seed == 6:
-            os._exit(1)
-        return super().reset(seed=seed, options=options)
 
 
 class Misbehaving(Toy):

@@ -1,4 +1,4 @@
-"""CarRacing variants, and controllers for them."""
+"""CarRacing variants, and controllers of any bundle."""
 
 import numpy as np
 
@@ -26,9 +26,7 @@ def vectors(bundle, count, seed=4, scale=0.3):
 
 
 def controller_of(bundle, task="car-racing", seed=4):
-    """A controller of the bundle and its variant."""
+    """A random controller of the bundle, under its own options."""
     (parameters,) = vectors(bundle, 1, seed)
-    variant = bundle.variant
-    return Controller(
-        bundle.controller_shape, parameters, task, bundle.sha256, {}, variant.options, variant.version
-    )  # fmt: skip
+    driving = bundle.driving
+    return Controller(bundle.controller_shape, parameters, task, bundle.sha256, {}, driving.options, driving.version)

@@ -1,6 +1,7 @@
 """Malformed bundles and data sets are refused in one line before anything runs.
 Tests common/artifacts/onnx_checks.py."""
 
+import re
 import shutil
 from dataclasses import replace
 
@@ -22,11 +23,19 @@ from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, PolicySte
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import npy
-from tests.support.drives import ignore, write_drives
+from tests.support.drives import ignore, train_models, write_drives
 from tests.support.models import random_models, weights
 
 LAYERS, RNN = VAEConfig(latent=4, channels=(4, 4, 8, 8)), MDNRNNConfig(latent=4, hidden=8, mixtures=2)
 SHORT = TrainConfig(updates=2, batch=8, rate=1e-3)
+
+
+WHOLE = {INITIAL_LATENTS_PART: np.zeros((4, 2, 32), np.float32), RECORDED_STATES: np.zeros((4, 576), np.float16)}
+
+
+def damaged(whole):
+    """An array's content spoilt."""
+    return [whole + np.nan, whole + np.inf, whole.astype(np.int64), np.array([object()]), npy(whole)[:-1], b""]
 
 
 def parts_of(bundle):
@@ -54,43 +63,17 @@ def test_what_ships_and_what_is_no_model_have_no_wrong_weights():
 
 
 @pytest.mark.parametrize(
-    "initial",
+    ("part", "content"),
     [
-        npy(np.zeros((0, 2, 32), np.float32)),
-        npy(np.zeros((4, 2, 16), np.float32)),
-        npy(np.full((4, 2, 32), np.nan, np.float32)),
-        npy(np.array([object()])),
-        npy(np.zeros(3, np.int64)),
-        b"",
-        npy(np.zeros((4, 2, 32), np.float32))[:-9],
+        *((INITIAL_LATENTS_PART, np.zeros(shape, np.float32)) for shape in ((0, 2, 32), (4, 2, 16))),
+        *((RECORDED_STATES, np.zeros(shape, np.float16)) for shape in ((0, 576), (16_385, 576), (4, 575), (4, 2, 576))),
+        *((part, content) for part, whole in WHOLE.items() for content in damaged(whole)),
     ],
 )
-def test_a_dream_begins_at_real_latents(random_bundle, tmp_path, initial):
-    with pytest.raises(BundleError):
-        write_bundle(
-            tmp_path / "b.zip", random_bundle.manifest, {**parts_of(random_bundle), INITIAL_LATENTS_PART: initial}
-        )
-
-
-@pytest.mark.parametrize(
-    "recorded",
-    [
-        npy(np.zeros((0, 576), np.float16)),
-        npy(np.zeros((16_385, 576), np.float16)),
-        npy(np.zeros((4, 575), np.float16)),
-        npy(np.zeros((4, 2, 576), np.float16)),
-        npy(np.full((4, 576), np.nan, np.float16)),
-        npy(np.full((4, 576), np.inf, np.float16)),
-        npy(np.array([object()])),
-        npy(np.zeros(576, np.int64)),
-        b"",
-        npy(np.zeros((4, 576), np.float16))[:-1],
-    ],
-)
-def test_damaged_recorded_states_are_one_clear_line(random_bundle, tmp_path, recorded):
-    parts = {**parts_of(random_bundle), RECORDED_STATES: recorded}
-    with pytest.raises(BundleError, match=r"b\.zip.*recorded_states\.npy") as caught:
-        write_bundle(tmp_path / "b.zip", random_bundle.manifest, parts)
+def test_damaged_latents_or_states_that_dreams_begin_at_are_one_clear_line(random_bundle, tmp_path, part, content):
+    data = content if isinstance(content, bytes) else npy(content)
+    with pytest.raises(BundleError, match=rf"b\.zip.*{re.escape(part)}") as caught:
+        write_bundle(tmp_path / "b.zip", random_bundle.manifest, {**parts_of(random_bundle), part: data})
     assert "\n" not in str(caught.value)
 
 
@@ -102,21 +85,11 @@ def test_graphs_of_other_sizes_than_the_manifest_says_are_refused(random_bundle,
             part(other)
 
 
-def test_a_truncated_dream_is_an_error_of_the_bundle(random_bundle, tmp_path):
-    parts = parts_of(random_bundle)
-    cut = write_bundle(tmp_path / "b.zip", random_bundle.manifest, {**parts, DREAM_GRAPH: parts[DREAM_GRAPH][:5000]})
-    with pytest.raises(BundleError, match=r"dream\.onnx"):
-        DreamStep(cut)
-
-
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data")
     write_drives(folder, episodes=4, steps=6)
-    train_vae.train_vae(folder, SHORT, ignore, LAYERS)
-    list(encode(folder))
-    train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, RNN)
-    return folder
+    return train_models(folder, SHORT, LAYERS, RNN)
 
 
 @pytest.fixture
@@ -129,19 +102,16 @@ def test_a_half_written_episode_stops_training_before_its_first_update(folder):
     path.write_bytes(path.read_bytes()[:-50])
     (folder / train_vae.CHECKPOINT).unlink()
     seen = []
-    for stage in (
-        lambda: train_vae.train_vae(folder, SHORT, lambda done, _: seen.append(done), LAYERS),
-        lambda: train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, RNN),
-    ):
-        with pytest.raises(DatasetError):
-            stage()
+    with pytest.raises(DatasetError):
+        train_vae.train_vae(folder, SHORT, lambda done, _: seen.append(done), LAYERS)
+    with pytest.raises(DatasetError):
+        train_mdnrnn.train_mdnrnn(folder, SHORT, lambda done, _: seen.append(done), RNN)
     assert not seen
 
 
 def test_an_episode_without_its_actions_is_refused(folder):
     path = sorted((folder / "episodes").glob("*.npz"))[1]
-    arrays = load_arrays(path, "picture", "reward", "preprocessing", "ended")
-    np.savez(path, **arrays)
+    np.savez(path, **load_arrays(path, "picture", "reward", "preprocessing", "ended"))
     with pytest.raises(DatasetError, match=r"action\.npy"):
         list(encode(folder))
 
@@ -170,43 +140,37 @@ def test_data_that_are_no_numbers_stop_training_and_keep_the_checkpoint(folder):
     assert (folder / train_mdnrnn.CHECKPOINT).read_bytes() == before
 
 
-def with_weights_elsewhere(model):
-    """A model whose first initialiser is stored in another file."""
-    tensor = model.graph.initializer[0]
-    elsewhere(tensor)
-
-
-def numbers():
-    return onnx.numpy_helper.from_array(np.zeros(2, np.float32), "c")
-
-
-def with_a_constant_elsewhere(model):
-    node = onnx.helper.make_node("Constant", [], ["c"], value=numbers())
-    elsewhere(node.attribute[0].t)
-    model.graph.node.append(node)
-
-
-def with_a_branch_elsewhere(model):
-    inner = onnx.helper.make_graph([], "inner", [], [], [numbers()])
-    elsewhere(inner.initializer[0])
-    model.graph.node.append(onnx.helper.make_node("If", ["x"], ["y"], then_branch=inner, else_branch=inner))
-
-
-def with_a_function_elsewhere(model):
-    node = onnx.helper.make_node("Constant", [], ["c"], value=numbers())
-    elsewhere(node.attribute[0].t)
-    model.functions.append(onnx.helper.make_function("own", "f", [], ["c"], [node], []))
-
-
 def elsewhere(tensor):
+    """The tensor, stored in another file."""
     tensor.ClearField("raw_data")
     tensor.ClearField("float_data")
     tensor.data_location = onnx.TensorProto.EXTERNAL
     tensor.external_data.add(key="location", value="secret.bin")
+    return tensor
+
+
+def numbers():
+    return elsewhere(onnx.numpy_helper.from_array(np.zeros(2, np.float32), "c"))
+
+
+def constant():
+    return onnx.helper.make_node("Constant", [], ["c"], value=numbers())
+
+
+def branch():
+    inner = onnx.helper.make_graph([], "inner", [], [], [numbers()])
+    return onnx.helper.make_node("If", ["x"], ["y"], then_branch=inner, else_branch=inner)
 
 
 @pytest.mark.parametrize(
-    "change", [with_weights_elsewhere, with_a_constant_elsewhere, with_a_branch_elsewhere, with_a_function_elsewhere]
+    "change",
+    [
+        lambda model: elsewhere(model.graph.initializer[0]),
+        lambda model: model.graph.node.append(constant()),
+        lambda model: model.graph.node.append(branch()),
+        lambda model: model.functions.append(onnx.helper.make_function("own", "f", [], ["c"], [constant()], [])),
+    ],
+    ids=["weights", "constant", "branch", "function"],
 )
 def test_a_graph_reads_no_other_file(random_bundle, tmp_path, monkeypatch, change):
     monkeypatch.chdir(tmp_path)
@@ -219,16 +183,18 @@ def test_a_graph_reads_no_other_file(random_bundle, tmp_path, monkeypatch, chang
 
 
 @pytest.mark.parametrize(
-    "graph",
+    "change",
     [
-        b"\x08\x08\x00\x00ORTM" + bytes(100),  # the runtime's own format
-        b"\xba\x80\x80\x80\x10\x00",  # field 7, if 32 bits of its number are looked at
-        b"\x3b\x3c",  # a group
+        lambda whole: whole[:5000],
+        lambda _whole: b"\x08\x08\x00\x00ORTM" + bytes(100),  # the runtime's own format
+        lambda _whole: b"\xba\x80\x80\x80\x10\x00",  # field 7, if 32 bits of its number are looked at
+        lambda _whole: b"\x3b\x3c",  # a group
     ],
 )
-def test_what_the_runtime_might_read_otherwise_is_not_run(random_bundle, tmp_path, graph):
-    path = tmp_path / "b.zip"
-    bundle = write_bundle(path, random_bundle.manifest, {**parts_of(random_bundle), DREAM_GRAPH: graph})
+def test_a_graph_that_is_cut_or_that_the_runtime_might_read_otherwise_is_not_run(random_bundle, tmp_path, change):
+    parts = parts_of(random_bundle)
+    parts[DREAM_GRAPH] = change(parts[DREAM_GRAPH])
+    bundle = write_bundle(tmp_path / "b.zip", random_bundle.manifest, parts)
     with pytest.raises(BundleError, match=r"dream\.onnx"):
         DreamStep(bundle)
 

@@ -9,6 +9,7 @@ from dreamfleet.worker.training.data.rollouts import Rollouts, done_labels
 from dreamfleet.worker.training.prediction_quality import end_quality
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, binary_loss
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig, calibrate_end
+from tests.support.drives import write_encoded
 
 CONFIG = MDNRNNConfig(latent=1, hidden=4, done=True, lost=3)
 
@@ -34,7 +35,7 @@ def drives(*rewards, ended=False):
         ([1, 1, -1, -1, -1], "00000"),  # whether it came back was not seen
         ([1, 1, -1, -1, -1, -1], "011111"),  # given up
         ([-1, -1, -1, -1], "1111"),  # it never moved
-        ([-1, -1, -1, 1], "000" + "0"),
+        ([-1, -1, -1, 1], "0000"),
     ],
 )
 def test_a_step_is_lost_where_no_reward_follows_for_so_long(rewards, lost):
@@ -88,23 +89,12 @@ def test_certain_ends_stay_certain_and_without_a_weight_no_bit_changes():
     assert calibrate_end(found, 7.0).dtype == np.float32
 
 
-def encoded_drives(folder, count, steps):
-    """Drives of which each ends at its last step."""
-    paths = [folder / f"{number:06d}.npz" for number in range(count)]
-    for path in paths:
-        zeros, action = np.zeros((steps, 1), np.float32), np.zeros((steps, 3), np.float32)
-        np.savez(path, mu=zeros, logvar=zeros, action=action, reward=zeros[:, 0], ended=np.array(True))
-    return paths
-
-
 @pytest.mark.parametrize("weight", [1.0, 4.0])
 def test_the_quality_of_ends_is_of_calibrated_probabilities(tmp_path, weight):
     model = MDNRNN(MDNRNNConfig(latent=1, hidden=4, reward="none", done=True, done_weight=weight))
     with torch.no_grad():  # it predicts an end with probability 0.2 at every step
         model.heads.weight.zero_()
         model.heads.bias.fill_(np.log(weight * 0.2 / 0.8))
-    figures = end_quality(model, encoded_drives(tmp_path, 45, steps=10))
-    assert figures == {
-        "done_brier": pytest.approx(0.1 * 0.8**2 + 0.9 * 0.2**2), "done_calibration": pytest.approx(2),
-    }  # fmt: skip
+    figures = end_quality(model, write_encoded(tmp_path, np.zeros((45, 10)), latent=1, ended=True))
+    assert figures == pytest.approx({"done_brier": 0.1 * 0.8**2 + 0.9 * 0.2**2, "done_calibration": 2})
     assert end_quality(MDNRNN(replace(model.config, done=False, done_weight=1)), []) == {}

@@ -1,4 +1,4 @@
-"""Factors weight the parts of a loss; the default 1 is not serialised, and reported losses are unweighted.
+"""Factors weight the parts of a loss; reported losses are unweighted.
 Tests worker/worldmodel/config_fields.py."""
 
 import json
@@ -10,20 +10,17 @@ import torch
 
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.worker.training import train_mdnrnn, train_vae
-from dreamfleet.worker.training.assemble import assemble, make_manifest
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights
 from dreamfleet.worker.training.data.rollouts import load_rollouts
-from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.presets import TrainConfig
-from dreamfleet.worker.training.stages.train import train_model
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae import VAE, PixelWeights
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
-from tests.support.drives import ignore, write_drives
-from tests.support.phase_requests import requests
+from tests.support.drives import ignore, linked, train_models, write_drives, write_encoded
 
 LAYERS, RNN = VAEConfig(latent=4, channels=(4, 4, 8, 8)), MDNRNNConfig(latent=4, hidden=8, mixtures=2)
+ENDING = replace(RNN, done=True)
 SHORT = TrainConfig(updates=2, batch=8, rate=1e-3, validate_every=1)
 
 
@@ -31,20 +28,7 @@ SHORT = TrainConfig(updates=2, batch=8, rate=1e-3, validate_every=1)
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data")
     write_drives(folder, episodes=4, steps=8)
-    train_vae.train_vae(folder, SHORT, ignore, LAYERS)
-    assert len(list(encode(folder))) == 4
-    train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, RNN)
-    return folder
-
-
-def linked(trained, folder, *names):
-    for name in names:
-        (folder / name).symlink_to(trained / name)
-    return folder
-
-
-def points(path):
-    return [json.loads(line) for line in path.read_text().splitlines()]
+    return train_models(folder, SHORT, LAYERS, RNN)
 
 
 @pytest.mark.parametrize(("loss", "scale"), [("paper", 1), ("notebook", 1000 / (3 * 64**2))])
@@ -59,12 +43,10 @@ def test_the_error_is_weighed_against_the_divergence(loss, scale):
 def test_a_factor_changes_what_is_learnt_and_held_out_losses_stay_comparable(trained, tmp_path):
     layers, reported, learnt = replace(LAYERS, loss="notebook"), [], []
     for factor in (1.0, 4.0):
-        folder = tmp_path / f"{factor}"
-        folder.mkdir()
-        linked(trained, folder, "episodes")
+        folder = linked(trained, tmp_path / f"{factor}", "episodes")
         still = replace(SHORT, updates=1, rate=1e-12)
         train_vae.train_vae(folder, still, ignore, replace(layers, error_factor=factor))
-        reported.append(points(folder / "vae.jsonl")[-1])
+        reported.append(json.loads((folder / "vae.jsonl").read_text().splitlines()[-1]))
         train_vae.train_vae(folder, SHORT, ignore, replace(layers, error_factor=factor))
         learnt.append(load_weights(folder / train_vae.CHECKPOINT))
     assert reported[0] == pytest.approx(reported[1])
@@ -72,47 +54,37 @@ def test_a_factor_changes_what_is_learnt_and_held_out_losses_stay_comparable(tra
     assert not np.array_equal(learnt[0]["mu.weight"], learnt[1]["mu.weight"])
 
 
-def test_latents_and_rewards_are_weighted_in_the_gradients_and_not_in_reported_losses(trained):
-    rollouts = load_rollouts(sorted((trained / "encoded").glob("*.npz")))
-    gradients, reported = [], []
-    for z, reward in ((1.0, 1.0), (1.0, 3.0), (2.0, 1.0), (2.0, 3.0)):
-        torch.manual_seed(0)
-        model = MDNRNN(replace(RNN, z_factor=z, reward_factor=reward))
-        reported.append(train_mdnrnn.backward(model, rollouts, torch.Generator().manual_seed(0)))
-        gradients.append(model.heads.weight.grad)
+@pytest.fixture(scope="module")
+def rollouts(trained):
+    return load_rollouts(sorted((trained / "encoded").glob("*.npz")))
+
+
+def gradients(rollouts, **changes):
+    """Those of the heads, and the reported losses."""
+    torch.manual_seed(0)
+    model = MDNRNN(replace(RNN, **changes))
+    reported = train_mdnrnn.backward(model, rollouts, torch.Generator().manual_seed(0))
+    return model.heads.weight.grad, reported
+
+
+def test_latents_and_rewards_are_weighted_in_the_gradients_and_not_in_reported_losses(rollouts):
+    factors = {}, {"reward_factor": 3.0}, {"z_factor": 2.0}, {"z_factor": 2.0, "reward_factor": 3.0}
+    (plain, rewards, latents, both), reported = zip(*(gradients(rollouts, **each) for each in factors), strict=True)
     assert all(each == reported[0] for each in reported)
-    plain, rewards, latents, both = gradients
     torch.testing.assert_close(both, rewards + latents - plain)
     torch.testing.assert_close(rewards[-1], 3 * plain[-1])  # the reward head's row
     torch.testing.assert_close(latents[:-1], 2 * plain[:-1])
 
 
-def gradients(rollouts, **changes):
-    torch.manual_seed(0)
-    model = MDNRNN(replace(RNN, done=True, **changes))
-    reported = train_mdnrnn.backward(model, rollouts, torch.Generator().manual_seed(0))
-    return model.heads.weight.grad, reported
-
-
-def test_ends_are_weighted_as_a_class_and_as_a_part(trained):
-    rollouts = load_rollouts(sorted((trained / "encoded").glob("*.npz")))
+def test_ends_are_weighted_as_a_class_and_as_a_part(rollouts):
     never, ended = (replace(rollouts, done=value * rollouts.mask) for value in (0, 1))
-    plain, reported = gradients(ended)
-    whole, weighted = gradients(ended, done_factor=3.0)
+    plain, reported = gradients(ended, done=True)
+    whole, weighted = gradients(ended, done=True, done_factor=3.0)
     assert weighted == reported
     torch.testing.assert_close(whole[-1], 3 * plain[-1])  # the done head's row
-    torch.testing.assert_close(gradients(ended, done_weight=3.0)[0], whole)
-    assert torch.equal(gradients(never, done_weight=3.0)[0], gradients(never)[0])
+    torch.testing.assert_close(gradients(ended, done=True, done_weight=3.0)[0], whole)
+    assert torch.equal(gradients(never, done=True, done_weight=3.0)[0], gradients(never, done=True)[0])
     assert torch.equal(whole[:-1], plain[:-1])
-
-
-def test_at_one_nothing_is_written_and_files_from_before_factors_open(trained, tmp_path):
-    bundle = assemble(trained, tmp_path / "b.zip", "b", with_weights=False)
-    assert not any("factor" in name for model in bundle.manifest.models.values() for name in model)
-    assert load_config(trained / train_vae.CHECKPOINT, VAEConfig).error_factor == 1.0
-    weighed = make_manifest("b", {}, replace(LAYERS, error_factor=4.0), replace(RNN, reward_factor=2.0))
-    assert weighed.models["vae"]["error_factor"] == 4.0
-    assert weighed.models["mdnrnn"]["reward_factor"] == 2.0
 
 
 def test_a_training_goes_on_under_its_own_factors_only(trained):
@@ -124,31 +96,11 @@ def test_a_training_goes_on_under_its_own_factors_only(trained):
 
 @pytest.mark.parametrize("value", [0.0, -1.0, 1e7, float("nan"), float("inf")])
 def test_a_factor_that_weighs_nothing_or_all_is_refused(value):
-    for change in (
-        lambda: VAEConfig(error_factor=value), lambda: MDNRNNConfig(z_factor=value),
-        lambda: MDNRNNConfig(reward_factor=value), lambda: MDNRNNConfig(done=True, done_factor=value),
-    ):  # fmt: skip
+    for config, name in ((LAYERS, "error_factor"), (RNN, "z_factor"), (RNN, "reward_factor"), (ENDING, "done_factor")):
         with pytest.raises(UsageError, match=r"1e-06.*1e\+06"):
-            change()
+            replace(config, **{name: value})
     with pytest.raises(UsageError):
         MDNRNNConfig(reward="none", reward_factor=2.0)
-
-
-def test_flags_pass_through_an_iteration_to_the_training(trained, tmp_path):
-    linked(trained, tmp_path, "episodes")
-    asked = requests(vae_flags="--updates 1 --set error_factor=4 channels=2,2,4,4").train(1, "vae")
-    train_model(replace(asked, data=tmp_path))
-    assert load_config(tmp_path / train_vae.CHECKPOINT, VAEConfig).error_factor == 4.0
-
-
-def write_encoded(folder, rewards, actions=1):
-    """Encoded drives of four latents with these rewards `(episodes, T)`."""
-    (folder / "encoded").mkdir(parents=True)
-    for number, reward in enumerate(np.asarray(rewards, np.float32)):
-        rows = [np.zeros((len(reward), size), np.float32) for size in (4, 4, actions)]
-        np.savez(folder / "encoded" / f"{number:06d}.npz", **dict(zip(("mu", "logvar", "action"), rows, strict=True)),
-                 reward=reward, ended=np.array(False))  # fmt: skip
-    return folder
 
 
 def test_a_model_has_as_many_actions_as_its_drives(tmp_path):
@@ -158,24 +110,19 @@ def test_a_model_has_as_many_actions_as_its_drives(tmp_path):
 
 
 def test_the_scale_of_rewards_is_measured_once_and_kept_by_what_goes_on_from_it(trained, tmp_path):
-    value, own = replace(RNN, reward="value", reward_scale=0.0), train_mdnrnn.CHECKPOINT
-    data = tmp_path / "data"
-    data.mkdir()
-    linked(trained, data, "vae.safetensors", "encoded")
+    value, data, other = replace(RNN, reward="value", reward_scale=0.0), tmp_path / "data", tmp_path / "other"
+    own = linked(trained, data, "vae.safetensors", "encoded") / train_mdnrnn.CHECKPOINT
     train_mdnrnn.train_mdnrnn(data, SHORT, ignore, value)
     rewards = [np.load(path)["reward"] for path in sorted((trained / "encoded").glob("*.npz"))[1:]]  # one is held out
-    scale = load_config(data / own, MDNRNNConfig).reward_scale
+    scale = load_config(own, MDNRNNConfig).reward_scale
     assert scale == pytest.approx(np.std(np.concatenate(rewards)), rel=1e-5)
     train_mdnrnn.train_mdnrnn(data, replace(SHORT, updates=3), ignore, value)  # it goes on under the same flags
-    other = write_encoded(tmp_path / "other", [[1.0, 2.0], [1.0, 2.0], [3.0, 2.0]], actions=3)
-    assert train_mdnrnn.fit_layers(value, other, data / own).reward_scale == scale
+    write_encoded(other, [[1.0, 2.0], [1.0, 2.0], [3.0, 2.0]])
+    assert train_mdnrnn.fit_layers(value, other, own).reward_scale == scale
     assert train_mdnrnn.fit_layers(value, other).reward_scale == pytest.approx(np.std([1, 2, 3, 2]), rel=1e-5)
     assert train_mdnrnn.fit_layers(replace(value, reward="none"), other).reward_scale == 1
-
-
-def test_rewards_that_are_all_equal_are_not_scaled(tmp_path):
-    write_encoded(tmp_path, [[1.0] * 3] * 3)
-    assert train_mdnrnn.fit_layers(replace(RNN, reward="value", reward_scale=0.0), tmp_path).reward_scale == 1
+    write_encoded(tmp_path / "equal", [[1.0] * 3] * 3)
+    assert train_mdnrnn.fit_layers(value, tmp_path / "equal").reward_scale == 1, "there is nothing to scale"
 
 
 def test_an_error_counts_by_how_far_its_pixel_is_from_the_mean_picture():
@@ -195,7 +142,6 @@ def test_a_training_with_weighted_pixels_resumes_to_the_bit_though_drives_were_a
     layers, learnt = replace(LAYERS, pixel_weight=3.0), []
     for name, first in (("whole", 4), ("stopped", 2)):
         folder = tmp_path / name
-        folder.mkdir()
         write_drives(folder, episodes=6, steps=8)
         train_vae.train_vae(folder, replace(SHORT, updates=first, validate_every=4), ignore, layers)
         measured = load_progress(folder / train_vae.CHECKPOINT)["pixels"]

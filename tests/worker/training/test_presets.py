@@ -1,32 +1,36 @@
-"""Presets match their sources; a data folder keeps the preset it was begun with."""
+"""Presets match their sources, flags change them, and a data folder keeps the one that it was begun with.
+Tests config_flags.py, worker/training/stages/collect.py, worker/verbs/collect.py and worker/verbs/train.py."""
 
 import json
-from argparse import ArgumentParser
 from dataclasses import fields
 
+import numpy as np
 import pytest
 import torch
 
-from dreamfleet.common.cli.command_line import build_parser
+from dreamfleet.common.cli.command_line import build_parser, main
 from dreamfleet.common.cli.presets import NAMES
 from dreamfleet.common.errors import DatasetError, UsageError
-from dreamfleet.worker.training import train_mdnrnn, train_vae
+from dreamfleet.worker.training import train_mdnrnn
+from dreamfleet.worker.training.checkpoint import load_config
 from dreamfleet.worker.training.data.collect_config import CollectConfig
 from dreamfleet.worker.training.data.data_folder import check_seed, load_preset, resolve_preset, store_preset
-from dreamfleet.worker.training.data.dataset import load_arrays
 from dreamfleet.worker.training.data.rollouts import Rollouts, load_rollouts, model_inputs, teacher_force
-from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.presets import PRESETS, TrainConfig
 from dreamfleet.worker.verbs import collect, train
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import NOTEBOOK, REWARDED, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
-from tests.support.drives import ignore, write_drive, write_drives
+from tests.support.drives import ignore, train_models, write_drive, write_drives
+from tests.support.events import scalars
 from tests.support.verbs import run_verb
 
 SHORT = TrainConfig(updates=2, batch=8, rate=1e-3)
 SMALL = {64: VAEConfig(channels=(2, 2, 4, 4)), 96: VAEConfig(picture=96, channels=(2, 2, 4, 4))}
-VERBS = ((collect,), (train, "vae"), (train, "mdnrnn"))
+
+
+def call(folder, verb, *words):
+    return run_verb(verb, *words, "--data", folder)
 
 
 def test_tiny_is_what_it_was():
@@ -38,14 +42,13 @@ def test_tiny_is_what_it_was():
 
 
 @pytest.mark.parametrize(
-    ("name", "episodes", "steps", "driver"),
-    [("notebook", 1000, 300, "uniform"), ("article", 2000, 300, "pushed"), ("paper", 10_000, 1000, "network")],
+    ("name", "drives"),
+    [("notebook", (1000, 300, "uniform")), ("article", (2000, 300, "pushed")), ("paper", (10_000, 1000, "network"))],
 )
-def test_a_sources_drives_begin_at_the_tracks_beginning_and_last_their_steps(name, episodes, steps, driver):
-    drives = PRESETS[name].collect
-    assert (drives.episodes, drives.steps, drives.driver) == (episodes, steps, driver)
-    assert (drives.anywhere, drives.patience) == (0, 0)
-    assert PRESETS[name].vae.rate == 1e-4
+def test_a_sources_drives_begin_at_the_tracks_beginning_and_last_their_steps(name, drives):
+    found = PRESETS[name].collect
+    assert (found.episodes, found.steps, found.driver) == drives
+    assert (found.anywhere, found.patience, PRESETS[name].vae.rate) == (0, 0, 1e-4)
 
 
 def test_the_notebooks_trainings_end_with_their_last_update():
@@ -64,28 +67,20 @@ def test_take_covers_models_predict_no_reward_and_weigh_its_ends_and_small_thing
     assert preset.collect.steps == 525  # decisions of 4 tics, 2,100 tics
 
 
-def test_other_presets_are_of_the_first_world_but_pixels_which_is_of_any():
-    assert {name: each.task for name, each in PRESETS.items() if each.task != "car-racing"} == {
-        "pixels": "", "takecover": "takecover",
-    }  # fmt: skip
-
-
-def test_every_preset_is_named_for_both_sides():
+def test_every_preset_is_named_for_both_sides_has_a_world_and_records_what_its_vae_sees():
     assert sorted(PRESETS) == sorted(NAMES["training"])
+    others = {"pixels": "", "takecover": "takecover"}
+    for name, preset in PRESETS.items():
+        assert preset.task == others.get(name, "car-racing")
+        assert preset.collect.picture == preset.vae_layers.picture
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("picture", [64, 96])
 def test_no_drive_is_mirrored_whose_pictures_show_the_indicators(tmp_path, picture, monkeypatch):
     write_drives(tmp_path, episodes=4, steps=6, picture=picture)
-    train_vae.train_vae(tmp_path, SHORT, ignore, SMALL[picture])
-    assert len(list(encode(tmp_path))) == 4
-    path = tmp_path / "encoded" / "000001.npz"
-    if picture == 96:
-        with pytest.raises(DatasetError):
-            load_arrays(path, "mirrored_mu")
-    else:
-        assert len(load_arrays(path, "mirrored_mu")["mirrored_mu"]) == 5
+    train_models(tmp_path, SHORT, SMALL[picture])
+    assert ("mirrored_mu" in np.load(tmp_path / "encoded" / "000001.npz")) == (picture == 64)
     taken = []
 
     def watched(paths, mirrored=None):
@@ -112,37 +107,26 @@ def test_a_drive_follows_from_the_first_reward_in_training_and_behind_it():
     assert states[0][0, 2 * NOTEBOOK.hidden] == 1
 
 
-@pytest.mark.parametrize("verb", [collect, train])
-def test_every_flag_says_what_it_does(verb):
-    parser = ArgumentParser()
-    verb.configure(parser)
-    assert [each.dest for each in parser._actions if not each.help] == []
-    assert parser.format_help()
-
-
 @pytest.mark.parametrize(
-    ("verb", "kinds"), [("collect", (CollectConfig,)), ("train", (TrainConfig, VAEConfig, MDNRNNConfig))]
+    ("name", "verb", "kinds"),
+    [("collect", collect, (CollectConfig,)), ("train", train, (TrainConfig, VAEConfig, MDNRNNConfig))],
 )
-def test_every_amount_and_layer_has_a_flag_or_a_key(verb, kinds):
-    parser = build_parser(verb, {"collect": collect, "train": train}[verb])
+def test_every_amount_and_layer_has_a_flag_or_a_key_and_every_flag_says_what_it_does(name, verb, kinds):
+    parser = build_parser(name, verb)
+    assert [each.dest for each in parser._actions if not each.help] == []
     said = {each.dest for each in parser._actions} | {key for texts in parser.keys.values() for key in texts}
     assert {each.name for kind in kinds for each in fields(kind)} - said <= {"actions"}
 
 
 def test_a_later_verb_without_the_data_sets_preset_is_refused(tmp_path, capsys):
-    assert (
-        run_verb(
-            collect, "--data", str(tmp_path), "--preset", "article", "--episodes", "2", "--steps", "3", "--jobs", "1"
-        )
-        == 0
-    )
+    assert call(tmp_path, collect, "--preset", "article", "--episodes", 2, "--steps", 3, "--jobs", 1) == 0
     assert load_preset(tmp_path) == "article"
-    for verb, *model in VERBS:
+    for verb, *model in ((collect,), (train, "vae"), (train, "mdnrnn")):
         with pytest.raises(UsageError, match="--preset article"):
-            run_verb(verb, *model, "--data", str(tmp_path))
+            call(tmp_path, verb, *model)
         with pytest.raises(UsageError, match=r"--preset paper.*--preset article"):
-            run_verb(verb, *model, "--data", str(tmp_path), "--preset", "paper")
-    assert run_verb(train, "vae", "--data", str(tmp_path), "--preset", "article", "--summary") == 0
+            call(tmp_path, verb, *model, "--preset", "paper")
+    assert call(tmp_path, train, "vae", "--preset", "article", "--summary") == 0
     assert "2,115,971" in capsys.readouterr().out
 
 
@@ -161,17 +145,118 @@ def test_a_damaged_preset_file_is_reported_in_a_line(tmp_path, content):
         resolve_preset(tmp_path, None)
 
 
-def test_a_preset_is_kept_once(tmp_path):
+def test_a_data_set_has_one_preset_and_one_seed(tmp_path):
+    check_seed(tmp_path, 7)
     store_preset(tmp_path, "paper", 5)
     store_preset(tmp_path, "tiny", 6)
     assert json.loads((tmp_path / "preset.json").read_text()) == {"preset": "paper", "seed": 5}
-
-
-def test_a_data_set_has_one_seed(tmp_path):
-    check_seed(tmp_path, 7)
-    store_preset(tmp_path, "paper", 5)
     check_seed(tmp_path, 5)
     with pytest.raises(UsageError, match=r"--seed 5.*--seed 7"):
         check_seed(tmp_path, 7)
-    (tmp_path / "preset.json").write_text('{"preset": "paper"}')  # from before seeds were kept
+    (tmp_path / "preset.json").write_text('{"preset": "paper"}')  # no seed is kept
     check_seed(tmp_path, 7)
+
+
+def test_flags_change_what_a_preset_says(tmp_path, capsys):
+    write_drives(tmp_path, episodes=3, steps=4)
+    changes = ("--set", "channels=2,2,4,4", "batch_norm=false", "--set", "padding=same")
+    call(tmp_path, train, "vae", "--updates", 1, *changes)
+    assert load_config(tmp_path / "vae.safetensors", VAEConfig) == VAEConfig(channels=(2, 2, 4, 4), padding="same")
+    assert "reconstruction_error" in capsys.readouterr().out
+
+
+def test_a_flag_says_how_large_pictures_are(tmp_path, capsys):
+    write_drives(tmp_path, episodes=3, steps=4, picture=96)
+    call(tmp_path, train, "vae", "--updates", 1, "--set", "picture=96", "channels=2,2,4,4")
+    assert load_config(tmp_path / "vae.safetensors", VAEConfig).picture == 96
+    capsys.readouterr()
+    assert call(tmp_path, collect, "--episodes", 3, "--picture", 96, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["new_episodes"], found["new_frames"], found["episodes"]) == (0, 0, 3)
+    with pytest.raises(DatasetError, match="--picture"):
+        call(tmp_path, collect, "--episodes", 4)
+
+
+def test_a_set_that_has_more_than_is_asked_for_is_counted_whole(tmp_path, capsys):
+    write_drives(tmp_path, episodes=3, steps=4)
+    write_drive(tmp_path, 7, steps=4)
+    assert call(tmp_path, collect, "--episodes", 4, "--jobs", 1, "--preset", "tiny", "--json") == 0
+    printed = capsys.readouterr()
+    found = json.loads(printed.out)
+    assert (found["new_episodes"], found["episodes"], "5/5" in printed.err) == (1, 5, True)
+
+
+def test_a_file_and_variables_say_settings_too(tmp_path, monkeypatch, capsys):
+    write_drives(tmp_path, episodes=3, steps=4)
+    (tmp_path / "settings.toml").write_text("[vae]\nchannels = [2, 2, 4, 4]\nlatent = 9\nkl_tolerance = 1\n")
+    monkeypatch.setenv("DREAMFLEET_VAE_LATENT", "8")
+    words = ["train", "vae", "--data", str(tmp_path), "--config", str(tmp_path / "settings.toml"), "--updates", "1"]
+    assert main([*words, "--set", "kl_tolerance=0.25"]) == 0
+    found = load_config(tmp_path / "vae.safetensors", VAEConfig)
+    assert found == VAEConfig(channels=(2, 2, 4, 4), latent=8, kl_tolerance=0.25)
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("vae", "--latent", "64"), "--set latent=64"),
+        (("vae", "--channels", "2", "4"), "--set channels=2,4"),
+        (("mdnrnn", "--done"), "--set done=true"),
+        (("vae", "--no-batch-norm"), "--set batch_norm=false"),
+        (("vae", "--set", "latnt=3"), "latnt"),
+        (("vae", "--set", "hidden=3"), "'hidden'"),
+        (("vae", "--set", "xyzzy=3"), "updates, batch, rate"),
+        (("vae", "--set", "latent"), "--set 'latent'"),
+        (("vae", "--set", "latent=many"), "'many'"),
+        (("vae", "--set", "channels=2,x"), "'x'"),
+        (("vae", "--set", "padding=odd"), "valid, same"),
+        (("mdnrnn", "--decoder-only"), "--decoder-only"),
+    ],
+)
+def test_a_wrong_setting_is_one_line_with_the_right_one(tmp_path, capsys, words, named):
+    assert main(["train", *words, "--data", str(tmp_path)]) == UsageError.exit_code
+    error = capsys.readouterr().err
+    assert named in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(("model", "count"), [("vae", "4,348,547"), ("mdnrnn", "422,368")])
+def test_a_summary_trains_nothing(tmp_path, capsys, model, count):
+    assert call(tmp_path / "absent", train, model, "--preset", "paper", "--summary") == 0
+    assert count in capsys.readouterr().out
+
+
+def test_a_set_goes_on_with_drives_of_controllers(tmp_path, capsys):
+    write_drives(tmp_path, episodes=3, steps=4)
+    flags = ("--episodes", 4, "--jobs", 1, "--steps", 5, "--runs-dir", tmp_path)
+    assert call(tmp_path, collect, *flags, "--controller", "tiny", "--noise", 0.1, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["episodes"] == 4
+    with np.load(tmp_path / "episodes" / "000003.npz") as drive:
+        assert (str(drive["driver"]), len(drive["action"])) == ("controller", 5)
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (("--noise", "0.1"), "--controller"),
+        (("--spells", "0.1"), "--controller"),
+        (("--driver", "network", "--controller", "tiny"), "--driver.*--controller"),
+        (("--driver", "ghost"), "random, held, .*network.*'ghost'"),
+        (("--from-run", "r", "--controller", "tiny"), "--controller"),
+    ],
+)
+def test_flags_of_controllers_that_do_not_drive_are_refused(tmp_path, flags, named):
+    with pytest.raises(UsageError, match=named):
+        call(tmp_path, collect, *flags)
+
+
+def test_losses_go_to_tensorboard_too_and_a_continued_training_adds_to_them(tmp_path):
+    data, events = tmp_path / "data", tmp_path / "events"
+    write_drives(data, episodes=3, steps=4)
+    settings = ("--set", "channels=2,2,4,4", "validate_every=1", "--tensorboard", events)
+    for updates in (1, 3):
+        call(data, train, "vae", *settings, "--updates", updates)
+    points = [json.loads(line) for line in (data / "vae.jsonl").read_text().splitlines()]
+    found = scalars(events / "vae")
+    assert [step for step, _ in found["loss/held_out"]] == [1, 2, 3]
+    assert [value for _, value in found["loss/held_out"]] == pytest.approx([each["held_out"] for each in points])

@@ -1,8 +1,11 @@
-"""Tests training_state.py and checkpoint.py."""
+"""A training that is interrupted, killed, or out of disk space resumes to the same bits.
+Tests training_state.py, checkpoint.py and worker/training/stages/train.py."""
 
+import json
 import shutil
+import signal
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,74 +14,282 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from dreamfleet.common.errors import DatasetError, StoppedError, UsageError
-from dreamfleet.worker.training import train_mdnrnn, train_vae
-from dreamfleet.worker.training.assemble import assemble
-from dreamfleet.worker.training.checkpoint import load_checkpoint, load_config, load_progress, load_weights
+from dreamfleet.common.files.locks import folder_lock
+from dreamfleet.common.host.stop_signals import stop_on_signals
+from dreamfleet.worker.training import checkpoint, train_mdnrnn, train_vae, training_state
+from dreamfleet.worker.training.assemble import QUALITY, assemble, load_quality, record_quality
+from dreamfleet.worker.training.checkpoint import load_checkpoint, load_progress, load_weights
 from dreamfleet.worker.training.data.rollouts import load_rollouts
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.presets import PRESETS, TrainConfig
-from dreamfleet.worker.training.training_state import select_device, summarise_model
+from dreamfleet.worker.training.stages.train import explain_interrupt
+from dreamfleet.worker.training.training_state import append_point, numbered_path, select_device
+from dreamfleet.worker.verbs import train as verb
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import ADDABLE_HEADS, MDNRNNConfig
-from dreamfleet.worker.worldmodel.vae import VAE
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
-from tests.support.drives import ignore, write_drive, write_drives
+from tests.support.disks import file_size_limit
+from tests.support.drives import ignore, linked, train_models, write_drive, write_drives
+from tests.support.verbs import run_verb
 
-LAYERS = VAEConfig(latent=4, channels=(4, 4, 8, 8), batch_norm=True, dropout=0.1)
-SMALL = MDNRNNConfig(latent=4, hidden=8, mixtures=2, dropout=0.2)
-SHORT = TrainConfig(updates=4, batch=8, rate=1e-3, validate_every=2)
+PLAIN = VAEConfig(latent=4, channels=(2, 2, 4, 4))
+LAYERS, RNN = replace(PLAIN, batch_norm=True, dropout=0.1), MDNRNNConfig(latent=4, hidden=8, mixtures=2, dropout=0.2)
+FLAGS = ("--set", "latent=4", "channels=2,2,4,4", "--batch", "8")
+SHORT = TrainConfig(updates=6, batch=8, rate=1e-3, validate_every=2)
+ENCODED = ("encoded", train_vae.CHECKPOINT)
+
+
+class KilledError(BaseException):
+    """Stands for a kill: no handler of the code under test catches it."""
 
 
 @pytest.fixture(scope="module")
-def encoded(tmp_path_factory):
+def drives(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data")
     write_drives(folder, episodes=4, steps=8)
-    train_vae.train_vae(folder, SHORT, ignore, LAYERS)
-    assert len(list(encode(folder))) == 4
-    return folder
+    return train_models(folder, SHORT, LAYERS)
 
 
-def linked(encoded, folder):
-    for name in ("encoded", train_vae.CHECKPOINT):
-        (folder / name).symlink_to(encoded / name)
-    return folder
+@pytest.fixture
+def data(drives, tmp_path):
+    return linked(drives, tmp_path, "episodes")
 
 
-def equal(one: Path, other: Path):
-    first, second = load_weights(one), load_weights(other)
-    return all(np.array_equal(first[name], second[name]) for name in first)
+@pytest.fixture
+def encoded(drives, tmp_path):
+    return linked(drives, tmp_path / "data", *ENCODED)
+
+
+def train(data, config=SHORT, report=ignore, layers=LAYERS, **more):
+    return train_vae.train_vae(data, config, report, layers, **more)
+
+
+def train_memory(folder, config=SHORT, layers=RNN, report=ignore, **more):
+    train_mdnrnn.train_mdnrnn(folder, config, report, layers, **more)
+    return folder / train_mdnrnn.CHECKPOINT
+
+
+def call(data, *words):
+    return run_verb(verb, "vae", "--data", data, *words, *FLAGS)
+
+
+def state(path):
+    return {name: array.tobytes() for name, array in load_weights(path).items()}, load_progress(path)
+
+
+def made(folder):
+    return sorted(path.name for path in folder.iterdir() if path.name != "episodes")
+
+
+def test_a_vae_that_is_worse_than_the_mean_picture_logs_a_warning(data, caplog):
+    figures = train(data, layers=PLAIN)
+    assert figures["reconstruction_error"] > figures["mean_picture_error"]
+    assert "--updates" in caplog.text
+
+
+def test_a_training_goes_on_by_the_seed_that_it_was_begun_with(data):
+    train(data)
+    with pytest.raises(UsageError, match=r"--seed 0.*--seed 3.*--seed 0"):
+        train(data, replace(SHORT, updates=8, seed=3))
+    assert load_progress(data / "vae.safetensors")["update"] == 6
+    train(data, replace(SHORT, seed=3), new=True)
+    assert load_progress(data / "vae.safetensors")["seed"] == 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("updates", "rate"), [(8, 1e-12), (4, 1e-3)])  # the first ends early
+def test_a_kill_at_any_write_of_a_checkpoint_leads_to_the_same_files(drives, tmp_path, monkeypatch, updates, rate):
+    config, writes = replace(SHORT, updates=updates, rate=rate, patience=2, keep_every=3), []
+
+    def killed_at(number):
+        def write(*given):
+            writes.append(given[0])
+            if len(writes) == number:
+                raise KilledError
+            checkpoint.save_checkpoint(*given)
+
+        writes.clear()
+        monkeypatch.setattr(training_state, "save_checkpoint", write)
+
+    def files(folder):
+        train_memory(folder, config)
+        return {path.name: state(path) for path in folder.glob("mdnrnn.*safetensors")}
+
+    killed_at(0)
+    expected = files(linked(drives, tmp_path / "whole", *ENCODED))
+    assert (expected["mdnrnn.safetensors"][1].get("stopped") is not None) == (rate == 1e-12)
+    for number in range(1, len(writes) + 1):
+        folder = linked(drives, tmp_path / f"{number}", *ENCODED)
+        killed_at(number)
+        with pytest.raises(KilledError):
+            files(folder)
+        assert files(folder) == expected
+
+
+def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(drives, data):
+    with file_size_limit() as limit, pytest.raises(DatasetError, match=r"vae\.safetensors"):
+        train(data, report=lambda done, _: limit(2000) if done == 3 else None)
+    assert load_progress(data / train_vae.CHECKPOINT)["update"] == 2
+    assert made(data) == ["vae.jsonl", "vae.safetensors"]
+    train(data)
+    assert state(data / train_vae.CHECKPOINT) == state(drives / train_vae.CHECKPOINT)
+
+
+def test_a_point_of_the_curve_is_whole_or_not_there(tmp_path):
+    path = tmp_path / "vae.jsonl"
+    append_point(path, update=20, error=1.0)
+    with file_size_limit() as limit:
+        limit(path.stat().st_size + 5)
+        with pytest.raises(DatasetError):
+            append_point(path, update=40, error=1.0)
+    append_point(path, update=60, error=1.0)
+    assert [json.loads(line)["update"] for line in path.read_text().splitlines()] == [20, 60]
+
+
+def test_signals_wait_until_a_checkpoint_is_written(data, monkeypatch):
+    real = checkpoint.save
+
+    def signalled(*given):
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.raise_signal(number)
+        return real(*given)
+
+    monkeypatch.setattr(checkpoint, "save", signalled)
+    with pytest.raises(KeyboardInterrupt), stop_on_signals() as stop:
+        train(data, stop=stop)
+    assert load_progress(data / train_vae.CHECKPOINT)["update"] == 2
+    assert made(data) == ["vae.jsonl", "vae.safetensors"]
+
+
+@pytest.mark.parametrize("new", [False, True])
+def test_a_second_signal_says_what_is_kept(data, new):
+    def twice(done, _note):
+        if done == 3:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGTERM)
+
+    with (
+        pytest.raises(StoppedError, match=r"vae\.safetensors.* 2") as stopped,
+        explain_interrupt(data / train_vae.CHECKPOINT, new),
+        stop_on_signals() as stop,
+    ):
+        train(data, SHORT, twice, stop=stop)
+    assert ("--new" in str(stopped.value)) == new
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b"\xff", b'{"done_auc": "high"}', b"[" * 9000])
+def test_damaged_figures_are_replaced_by_a_training_and_named_for_a_bundle(data, content, caplog):
+    (data / QUALITY).write_bytes(content)
+    with pytest.raises(DatasetError, match=QUALITY):
+        load_quality(data)
+    record_quality(data, {"error": 2.0})
+    assert QUALITY in caplog.text
+    record_quality(data, {"kl": 1.0})
+    assert load_quality(data) == {"error": 2.0, "kl": 1.0}
+
+
+def test_a_second_training_of_a_model_in_a_folder_is_refused(data):
+    with folder_lock(data / "vae.lock", "other"), pytest.raises(UsageError, match="VAE"):
+        call(data, "--updates", 1)
+    with folder_lock(data / "mdnrnn.lock", "other"):
+        assert call(data, "--updates", 1) == 0
+
+
+def test_a_training_without_data_makes_no_folder(tmp_path):
+    with pytest.raises(DatasetError, match="missing"):
+        call(tmp_path / "missing", "--updates", 1)
+    assert not (tmp_path / "missing").exists()
+
+
+def test_checkpoints_are_kept_beside_the_last_one(drives, data):
+    train(data, replace(SHORT, keep_every=4, updates=5))
+    last, kept = data / train_vae.CHECKPOINT, numbered_path(data / train_vae.CHECKPOINT, 4)
+    assert kept.name == "vae.000004.safetensors"
+    assert (load_progress(last)["update"], load_progress(kept)["update"]) == (5, 4)
+    last.write_bytes(kept.read_bytes())
+    train(data)
+    assert state(last) == state(drives / train_vae.CHECKPOINT)
+    with pytest.raises(UsageError, match="keep_every"):
+        replace(SHORT, keep_every=-1)
+
+
+def test_an_early_end_is_said_and_again_where_nothing_is_left_to_do(data, capsys):
+    words = (data, "--updates", 20, "--rate", 1e-12, "--set", "validate_every=1", "patience=2")
+    assert call(*words) == 0
+    assert "--patience" in capsys.readouterr().out
+    assert call(*words, "--json") == 0
+    ended = json.loads(capsys.readouterr().out)["ended_early"]
+    assert (ended["update"], ended["given_up_at"]) == (1, 3)
+    point = json.loads((data / "vae.jsonl").read_text().splitlines()[0])
+    assert ended["held_out_loss"] == pytest.approx(point["held_out"], abs=1e-5)
+    assert "ended_early" not in json.loads((data / "quality.json").read_text())
+    assert call(*words, "--set", "patience=0", "--updates", 2, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["ended_early"] is None
+
+
+def test_patience_that_comes_later_counts_from_then(data):
+    still = replace(SHORT, rate=1e-12, updates=2, validate_every=1)
+    train(data, still, layers=PLAIN)
+    (data / "vae.best.safetensors").write_bytes(b"of another training, and damaged")
+    train(data, replace(still, updates=20, patience=1), layers=PLAIN)
+    found = load_progress(data / train_vae.CHECKPOINT)
+    assert (found["update"], found["given_up_at"]) == (3, 4)
+
+
+def test_new_begins_anew_and_leaves_nothing_of_the_old_training(drives, data, capsys):
+    train(data, replace(SHORT, updates=3, patience=2, keep_every=2, seed=7))
+    before = load_weights(data / train_vae.CHECKPOINT)
+    updates = []
+    train(data, report=lambda done, _: updates.append(done), new=True)
+    assert updates == list(range(7))
+    assert made(data) == ["vae.jsonl", "vae.safetensors"]
+    assert state(data / train_vae.CHECKPOINT) == state(drives / train_vae.CHECKPOINT)
+    assert (data / "vae.jsonl").read_text() == (drives / "vae.jsonl").read_text()
+    assert not np.array_equal(before["mu.weight"], load_weights(data / train_vae.CHECKPOINT)["mu.weight"])
+    assert call(data, "--updates", 1, "--new", "--seed", 3) == 0
+    assert load_progress(data / train_vae.CHECKPOINT)["update"] == 1
+
+
+def test_new_begins_from_a_kept_checkpoint_and_never_from_what_it_replaces(data):
+    again = partial(train, data, layers=PLAIN)
+    again(replace(SHORT, keep_every=2))
+    last, kept = data / train_vae.CHECKPOINT, numbered_path(data / train_vae.CHECKPOINT, 4)
+    before = last.read_bytes()
+    for named, wrong in (
+        (r"--new.*--continue-from", {"continue_from": data / "." / last.name}),
+        (r"--decoder-only.*--continue-from", {"decoder_only": True}),
+        (r"absent\.safetensors", {"continue_from": data / "absent.safetensors"}),
+    ):
+        with pytest.raises(UsageError, match=named):
+            again(new=True, **wrong)
+    assert last.read_bytes() == before
+    again(replace(SHORT, updates=1, rate=1e-12), continue_from=kept, new=True)
+    one, other = load_weights(kept), load_weights(last)
+    assert all(np.allclose(one[name], other[name], atol=1e-9) for name in one)
+    assert made(data) == ["vae.000004.safetensors", "vae.jsonl", "vae.safetensors"]
 
 
 @pytest.mark.parametrize("after", [1, 3])  # neither is an update after which the held-out rollouts are looked at
-def test_a_stopped_training_keeps_every_update_and_resumes_to_the_same_weights(encoded, tmp_path, after):
-    (tmp_path / "episodes").symlink_to(encoded / "episodes")
-    made = []
+def test_a_stopped_training_keeps_every_update_and_resumes_to_the_same_bits(drives, data, after):
+    done = []
     with pytest.raises(StoppedError, match=rf"{after}.*vae\.safetensors"):
-        train_vae.train_vae(tmp_path, SHORT, lambda done, _: made.append(done), LAYERS, stop=lambda: made[-1] == after)
-    assert load_progress(tmp_path / train_vae.CHECKPOINT)["update"] == after
-    train_vae.train_vae(tmp_path, SHORT, ignore, LAYERS)
-    assert equal(encoded / train_vae.CHECKPOINT, tmp_path / train_vae.CHECKPOINT)
+        train(data, report=lambda number, _: done.append(number), stop=lambda: done[-1] == after)
+    assert load_progress(data / train_vae.CHECKPOINT)["update"] == after
+    train(data)
+    assert state(data / train_vae.CHECKPOINT) == state(drives / train_vae.CHECKPOINT)
 
 
-def test_a_stopped_mdnrnn_resumes_to_the_same_weights(encoded, tmp_path):
-    whole, parts = (tmp_path / name for name in ("whole", "parts"))
-    for folder in (whole, parts):
-        folder.mkdir()
-        linked(encoded, folder)
-    made = []
-    train_mdnrnn.train_mdnrnn(whole, SHORT, ignore, SMALL)
+def test_a_stopped_mdnrnn_resumes_to_the_same_bits(drives, encoded, tmp_path):
+    whole, done = train_memory(linked(drives, tmp_path / "whole", *ENCODED)), []
     with pytest.raises(StoppedError):
-        train_mdnrnn.train_mdnrnn(parts, SHORT, lambda done, _: made.append(done), SMALL, stop=lambda: made[-1] == 3)
-    train_mdnrnn.train_mdnrnn(parts, SHORT, ignore, SMALL)
-    assert equal(whole / train_mdnrnn.CHECKPOINT, parts / train_mdnrnn.CHECKPOINT)
+        train_memory(encoded, report=lambda number, _: done.append(number), stop=lambda: done[-1] == 3)
+    assert state(train_memory(encoded)) == state(whole)
 
 
-def test_a_decoder_that_learns_on_leaves_latents_and_mdnrnn_as_they_are(encoded, tmp_path):
-    before = load_weights(encoded / train_vae.CHECKPOINT)
-    folder = tmp_path / "data"
-    shutil.copytree(encoded, folder)
-    train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, SMALL)
-    train_vae.train_vae(folder, replace(SHORT, updates=6), ignore, LAYERS, decoder_only=True)
+def test_a_decoder_that_learns_on_leaves_latents_and_mdnrnn_as_they_are(drives, tmp_path):
+    before, folder = load_weights(drives / train_vae.CHECKPOINT), shutil.copytree(drives, tmp_path / "data")
+    train_memory(folder)
+    train(folder, replace(SHORT, updates=8), decoder_only=True)
     after = load_weights(folder / train_vae.CHECKPOINT)
     changed = {name for name in before if not np.array_equal(before[name], after[name])}
     assert changed
@@ -87,31 +298,19 @@ def test_a_decoder_that_learns_on_leaves_latents_and_mdnrnn_as_they_are(encoded,
     assemble(folder, tmp_path / "b.zip", "b", with_weights=False)
 
 
-def test_a_decoder_alone_needs_an_encoder(encoded, tmp_path):
-    (tmp_path / "episodes").symlink_to(encoded / "episodes")
+def test_a_decoder_alone_needs_an_encoder(drives, data):
     with pytest.raises(UsageError, match="--continue-from"):
-        train_vae.train_vae(tmp_path, SHORT, ignore, LAYERS, decoder_only=True)
-    checkpoint = encoded / train_vae.CHECKPOINT
-    train_vae.train_vae(tmp_path, SHORT, ignore, LAYERS, continue_from=checkpoint, decoder_only=True)
-    assert not equal(checkpoint, tmp_path / train_vae.CHECKPOINT)
-
-
-def test_a_checkpoint_keeps_its_layers_and_refuses_others(encoded):
-    assert load_config(encoded / train_vae.CHECKPOINT, VAEConfig) == LAYERS
-    with pytest.raises(DatasetError):
-        train_vae.train_vae(encoded, SHORT, ignore, replace(LAYERS, latent=5))
+        train(data, decoder_only=True)
+    source = drives / train_vae.CHECKPOINT
+    train(data, continue_from=source, decoder_only=True)
+    assert state(source)[0] != state(data / train_vae.CHECKPOINT)[0]
 
 
 def test_a_done_head_can_be_added_to_a_trained_mdnrnn(encoded, tmp_path):
     """Its weights stay, to the bit; Adam's moments too, except those of extended tensors."""
-    before, folder = tmp_path / "before.safetensors", tmp_path / "data"
-    shutil.copytree(encoded, folder)
-    checkpoint = folder / train_mdnrnn.CHECKPOINT
-    checkpoint.unlink(missing_ok=True)
-    train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, SMALL)
-    checkpoint.rename(before)
+    before, ending = train_memory(encoded).rename(tmp_path / "before.safetensors"), replace(RNN, done=True, lost=3)
     torch.manual_seed(4)
-    grown = MDNRNN(replace(SMALL, done=True, lost=3))
+    grown = MDNRNN(ending)
     optimiser = torch.optim.Adam(grown.parameters())
     own = grown.state_dict()["heads.weight"][-1].clone()
     assert load_checkpoint(before, grown, optimiser, ADDABLE_HEADS)
@@ -122,75 +321,57 @@ def test_a_done_head_can_be_added_to_a_trained_mdnrnn(encoded, tmp_path):
     moments = optimiser.state_dict()["state"]
     assert moments
     assert all(state["exp_avg"].shape == shapes[index] for index, state in moments.items())
-    ending = replace(SMALL, done=True, lost=3)
-    train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, ending, continue_from=before)
+    other = train_memory(encoded, layers=ending, continue_from=before).rename(tmp_path / "ending.safetensors")
     with pytest.raises(DatasetError):
-        load_checkpoint(checkpoint, MDNRNN(replace(ending, lost=5)), None, ADDABLE_HEADS)
-    other = checkpoint.rename(tmp_path / "ending.safetensors")
+        load_checkpoint(other, MDNRNN(replace(ending, lost=5)), None, ADDABLE_HEADS)
     with pytest.raises(DatasetError):
-        train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, SMALL, continue_from=other)
+        train_memory(encoded, continue_from=other)
 
 
-def test_a_checkpoint_that_is_cut_short_is_not_filled_up(encoded, tmp_path):
-    folder = linked(encoded, tmp_path)
-    train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, SMALL)
-    path = folder / train_mdnrnn.CHECKPOINT
+def test_a_checkpoint_that_is_cut_short_is_not_filled_up(encoded):
+    path = train_memory(encoded)
     whole = load_file(path)
     with safe_open(path, "pt") as file:
         about = file.metadata()
     save_file(whole | {"model.heads.bias": whole["model.heads.bias"][:2].contiguous()}, path, about)
     with pytest.raises(DatasetError):
-        load_checkpoint(path, MDNRNN(SMALL), None, ADDABLE_HEADS)
+        load_checkpoint(path, MDNRNN(RNN), None, ADDABLE_HEADS)
 
 
-def test_training_ends_when_held_out_drives_gain_nothing_and_goes_on_with_new_ones(encoded, tmp_path):
+def test_training_ends_when_held_out_drives_gain_nothing_and_goes_on_with_new_ones(tmp_path):
     write_drives(tmp_path, episodes=4, steps=8)
+    path, seen = tmp_path / train_vae.CHECKPOINT, []
     impatient = TrainConfig(updates=40, batch=8, rate=1e-12, patience=2, validate_every=1)
-    train_vae.train_vae(tmp_path, impatient, ignore, replace(LAYERS, batch_norm=False))
-    stopped = load_progress(tmp_path / train_vae.CHECKPOINT)
-    assert stopped["stopped"] == 3
-    assert stopped["update"] < 40
-    seen = []
-    train_vae.train_vae(tmp_path, impatient, lambda done, _: seen.append(done), replace(LAYERS, batch_norm=False))
-    assert seen == [stopped["update"]]
-    once_more = replace(impatient, patience=0, updates=stopped["update"] + 1)
-    kept = (tmp_path / train_vae.CHECKPOINT).read_bytes()
-    train_vae.train_vae(tmp_path, once_more, ignore, replace(LAYERS, batch_norm=False))
-    assert load_progress(tmp_path / train_vae.CHECKPOINT)["update"] == stopped["update"] + 1
-    (tmp_path / train_vae.CHECKPOINT).write_bytes(kept)
+
+    def progress(config):
+        seen.clear()
+        train(tmp_path, config, lambda done, _: seen.append(done), PLAIN)
+        return load_progress(path)
+
+    ended = progress(impatient)
+    kept = path.read_bytes()
+    assert ended["stopped"] == 3
+    assert ended["update"] < 40
+    progress(impatient)
+    assert seen == [ended["update"]]
+    assert progress(replace(impatient, patience=0, updates=ended["update"] + 1))["update"] == ended["update"] + 1
+    path.write_bytes(kept)
     write_drive(tmp_path, 4, steps=8)
-    train_vae.train_vae(tmp_path, impatient, lambda done, _: seen.append(done), replace(LAYERS, batch_norm=False))
-    assert len(seen) > 2
+    progress(impatient)
+    assert len(seen) > 1
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_every_presets_layers_train_and_foresee(encoded, tmp_path, name):
+def test_every_presets_layers_train_and_foresee(encoded, name):
     layers = replace(PRESETS[name].mdnrnn_layers, latent=4, hidden=8, done=True)
-    figures = train_mdnrnn.train_mdnrnn(linked(encoded, tmp_path), SHORT, ignore, layers)
+    figures = train_mdnrnn.train_mdnrnn(encoded, SHORT, ignore, layers)
     assert "nats_per_dimension" in figures
     assert any(name in figures for name in ("reward_auc", "reward_rmse")) == layers.has_reward_head
 
 
-def test_training_begins_from_another_checkpoint(encoded, tmp_path):
-    first, second = (tmp_path / name for name in ("first", "second"))
-    for folder in (first, second):
-        folder.mkdir()
-        linked(encoded, folder)
-    train_mdnrnn.train_mdnrnn(first, SHORT, ignore, SMALL)
-    source, still = first / train_mdnrnn.CHECKPOINT, replace(SHORT, updates=2, rate=1e-12)
-    train_mdnrnn.train_mdnrnn(second, still, ignore, SMALL, continue_from=source)
-    one, other = load_weights(source), load_weights(second / train_mdnrnn.CHECKPOINT)
-    assert all(np.allclose(one[name], other[name], atol=1e-9) for name in one)
-    (second / train_mdnrnn.CHECKPOINT).unlink()
-    with pytest.raises(UsageError):
-        train_mdnrnn.train_mdnrnn(second, still, ignore, SMALL, continue_from=tmp_path / "absent.safetensors")
-
-
-def test_a_batch_in_chunks_has_the_same_gradients(encoded, monkeypatch):
-    import torch
-
-    model = MDNRNN(replace(SMALL, dropout=0.0, done=True))
-    rollouts = load_rollouts(sorted((encoded / "encoded").glob("*.npz")))
+def test_a_batch_in_chunks_has_the_same_gradients(drives, monkeypatch):
+    model = MDNRNN(replace(RNN, dropout=0.0, done=True))
+    rollouts = load_rollouts(sorted((drives / "encoded").glob("*.npz")))
     rollouts.logvar.fill_(-100)  # chance is drawn a chunk at a time
     found = []
     for steps in (10_000, 1):
@@ -207,8 +388,3 @@ def test_a_device_that_is_not_there_is_refused():
     assert select_device("auto").type in ("cpu", "cuda")
     with pytest.raises(UsageError):
         select_device("abacus")
-
-
-def test_a_summary_counts_what_is_learnt():
-    assert summarise_model(MDNRNN(PRESETS["notebook"].mdnrnn_layers)).splitlines()[-1].split()[-1] == "423,649"
-    assert "BatchNorm2d" in summarise_model(VAE(LAYERS))

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
-from dreamfleet.common.artifacts.bundle import DECODER, DREAM_GRAPH, ENCODER, POLICY, WEIGHTS, Bundle, write_bundle
+from dreamfleet.common.artifacts.bundle import DECODER, DREAM_GRAPH, ENCODER, POLICY, WEIGHTS, write_bundle
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import BundleError, DatasetError, UsageError
 from dreamfleet.worker.addons.bundles.unbundle import unbundle
-from dreamfleet.worker.training import train_mdnrnn, train_vae
+from dreamfleet.worker.training import train_mdnrnn
 from dreamfleet.worker.training.assemble import export_graphs
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights
 from dreamfleet.worker.training.encode import encode, encoder_hash
@@ -19,76 +19,57 @@ from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.worldmodel.mdnrnn_config import ATTENTIVE, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
-from tests.support.drives import write_drives
+from tests.support.drives import ignore, write_drives
 from tests.support.models import random_models, weights
 
 EYES = VAEConfig(latent=4, channels=(2, 3, 2, 2))
 MEMORY = MDNRNNConfig(latent=4, hidden=6)
 
 
-def parts_again(folder):
-    vae, rnn = folder / train_vae.CHECKPOINT, folder / train_mdnrnn.CHECKPOINT
-    configs = load_config(vae, VAEConfig), load_config(rnn, MDNRNNConfig)
-    return export_graphs(
-        load_weights(vae), load_weights(rnn), np.zeros((1, 2, configs[0].latent), np.float32), *configs
-    )
+@pytest.fixture
+def plain(tmp_path):
+    return write_random_bundle(tmp_path / "a.zip", 3, EYES, MEMORY)
 
 
 @pytest.mark.parametrize(
-    "eyes",
+    ("eyes", "memory"),
     [
-        EYES,
-        replace(EYES, picture=96, padding="same"),
-        replace(EYES, dropout=0.1, activation="leaky_relu"),
-        replace(EYES, dense=8),
-        replace(EYES, activate_dense=True),
+        *((replace(EYES, **eyes), MEMORY) for eyes in (
+            {}, {"picture": 96, "padding": "same"}, {"dropout": 0.1, "activation": "leaky_relu"}, {"dense": 8},
+            {"activate_dense": True},
+        )),
+        *((EYES, replace(MEMORY, **memory)) for memory in (
+            {"done": True, "lost": 9}, {"reward": "none", "mixtures": 1}, {"joint": True, "done": True},
+            {"reward": "value", "previous_reward": True, "dropout": 0.1},
+        )),
+        (EYES, replace(ATTENTIVE, latent=4, hidden=6, window=3, attention_units=5)),
     ],
-)
-def test_the_same_eyes_are_bundled_from_it_again(tmp_path, eyes):
-    bundle = write_random_bundle(tmp_path / "a.zip", 3, eyes, MEMORY)
-    unbundle(bundle, tmp_path / "data")
-    again = parts_again(tmp_path / "data")
-    assert all(again[name] == bundle.read(name) for name in (ENCODER, DECODER, POLICY))
-
-
-@pytest.mark.parametrize(
-    "memory",
-    [
-        MEMORY,
-        replace(MEMORY, done=True, lost=9),
-        replace(MEMORY, reward="none", mixtures=1),
-        replace(MEMORY, joint=True, done=True),
-        replace(MEMORY, reward="value", previous_reward=True, dropout=0.1),
-        replace(ATTENTIVE, latent=4, hidden=6, window=3, attention_units=5),
-    ],
-)
-def test_the_same_dreams_are_bundled_from_it_again(tmp_path, memory):
-    bundle = write_random_bundle(tmp_path / "a.zip", 3, EYES, memory)
-    unbundle(bundle, tmp_path / "data")
-    again = parts_again(tmp_path / "data")
-    assert all(again[name] == bundle.read(name) for name in (DREAM_GRAPH, POLICY))
-
-
-def test_nothing_was_learnt_yet_and_the_memory_is_of_these_eyes(tmp_path):
-    bundle = write_random_bundle(tmp_path / "a.zip", 3, EYES, MEMORY)
+)  # fmt: skip
+def test_the_same_graphs_are_bundled_from_it_again_and_nothing_was_learnt_yet(tmp_path, eyes, memory):
+    bundle = write_random_bundle(tmp_path / "a.zip", 3, eyes, memory)
     vae, rnn = unbundle(bundle, tmp_path)
+    again = export_graphs(
+        load_weights(vae), load_weights(rnn), np.zeros((1, 2, 4), np.float32), load_config(vae, VAEConfig),
+        load_config(rnn, MDNRNNConfig),
+    )  # fmt: skip
+    assert all(again[name] == bundle.read(name) for name in (ENCODER, DECODER, DREAM_GRAPH, POLICY))
     assert load_progress(vae) == {"update": 0}
     assert load_progress(rnn) == {"update": 0, "vae": encoder_hash(tmp_path)}
 
 
-def test_training_goes_on_from_it_also_with_a_head_more(tmp_path):
+def test_training_goes_on_from_it_also_with_a_head_more(plain, tmp_path):
     write_drives(tmp_path, episodes=3, steps=8)
-    unbundle(write_random_bundle(tmp_path / "a.zip", 3, EYES, MEMORY), tmp_path)
+    unbundle(plain, tmp_path)
     assert len(list(encode(tmp_path))) == 3
     rnn = tmp_path / train_mdnrnn.CHECKPOINT
     before = load_weights(rnn)
     few, ending = TrainConfig(updates=1, batch=2, rate=1e-9), replace(MEMORY, done=True, lost=4)
-    train_mdnrnn.train_mdnrnn(tmp_path, few, lambda *_: None, ending)
+    train_mdnrnn.train_mdnrnn(tmp_path, few, ignore, ending)
     for name, values in load_weights(rnn).items():
         np.testing.assert_allclose(values[: len(before[name])], before[name], atol=1e-6)
     assert load_config(rnn, MDNRNNConfig) == ending
     with pytest.raises(DatasetError):
-        train_mdnrnn.train_mdnrnn(tmp_path, replace(few, updates=2), lambda *_: None, MEMORY)
+        train_mdnrnn.train_mdnrnn(tmp_path, replace(few, updates=2), ignore, MEMORY)
 
 
 def test_weights_that_a_bundle_keeps_are_taken_as_they_were(tmp_path):
@@ -120,9 +101,8 @@ def test_weights_that_a_bundle_keeps_are_taken_as_they_were(tmp_path):
         (EYES, replace(MEMORY, reward="value")),
     ],
 )
-def test_models_that_cannot_be_restored_are_refused(tmp_path, eyes, memory):
+def test_models_that_cannot_be_restored_are_refused(plain, tmp_path, eyes, memory):
     """The manifest of one bundle with the graphs of another."""
-    plain = write_random_bundle(tmp_path / "a.zip", 3, EYES, MEMORY)
     other = write_random_bundle(tmp_path / "b.zip", 3, eyes, memory)
     parts = {name: plain.read(name) for name in plain.manifest.parts}
     manifest = replace(plain.manifest, models=other.manifest.models)
@@ -132,16 +112,13 @@ def test_models_that_cannot_be_restored_are_refused(tmp_path, eyes, memory):
 
 
 @pytest.mark.parametrize("part", [ENCODER, DECODER, DREAM_GRAPH])
-def test_a_graph_that_is_none_is_refused_in_a_line(tmp_path, part):
-    plain = write_random_bundle(tmp_path / "a.zip", 3, EYES, MEMORY)
+def test_a_graph_that_is_none_is_refused_in_a_line(plain, tmp_path, part):
     parts = {name: plain.read(name) for name in plain.manifest.parts} | {part: b"\0junk" * 100}
     with pytest.raises(BundleError):
         unbundle(write_bundle(tmp_path / "b.zip", plain.manifest, parts), tmp_path / "data")
 
 
-def test_where_one_of_both_cannot_be_written_neither_is(tmp_path, monkeypatch):
-    plain = write_random_bundle(tmp_path / "a.zip", 3, EYES, MEMORY)
-
+def test_where_one_of_both_cannot_be_written_neither_is(plain, tmp_path, monkeypatch):
     def full(path, *_):
         if path.name == train_mdnrnn.CHECKPOINT:
             raise DatasetError("no space left")
@@ -157,12 +134,10 @@ def test_where_one_of_both_cannot_be_written_neither_is(tmp_path, monkeypatch):
         unbundle(plain, tmp_path / "a.zip")
 
 
-def test_models_that_are_there_stay(tmp_path, capsys):
-    write_random_bundle(tmp_path / "a.zip", 3, EYES, MEMORY)
-    assert main(["bundle", "--extract", str(tmp_path / "a.zip"), "--data", str(tmp_path / "data"), "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
-    assert printed["bundle"] == Bundle.open(tmp_path / "a.zip").sha256
+def test_models_that_are_there_stay(plain, tmp_path, capsys):
+    assert main(["bundle", "--extract", str(plain.path), "--data", str(tmp_path / "data"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["bundle"] == plain.sha256
     before = (tmp_path / "data" / "vae.safetensors").read_bytes()
     with pytest.raises(UsageError):
-        unbundle(Bundle.open(tmp_path / "a.zip"), tmp_path / "data")
+        unbundle(plain, tmp_path / "data")
     assert (tmp_path / "data" / "vae.safetensors").read_bytes() == before

@@ -1,4 +1,4 @@
-"""Tests evaluation.py, evaluation_report.py, verb.py and worker/addons/verification/report_verb.py."""
+"""Tests evaluation.py, evaluation_report.py, agents.py, verb.py and worker/addons/verification/report_verb.py."""
 
 import json
 import os
@@ -9,46 +9,61 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.errors import BundleError, ControllerError, DreamfleetError, UsageError
 from dreamfleet.common.host.fingerprint import fingerprint
-from dreamfleet.common.runs.episode_results import EpisodeResults
-from dreamfleet.common.runs.lookup import find_bundle_of
+from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
+from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
+from dreamfleet.worker.addons.evaluation import evaluation
 from dreamfleet.worker.addons.evaluation.agents import make_agent
-from dreamfleet.worker.addons.evaluation.evaluation import evaluate, evaluate_in_processes
+from dreamfleet.worker.addons.evaluation.evaluation import (
+    AgentEvaluator,
+    DriveStatistics,
+    evaluate,
+    evaluate_in_processes,
+)
 from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
 from dreamfleet.worker.scoring import episode
-from dreamfleet.worker.scoring.episode import EpisodeConfig
+from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition
+from dreamfleet.worker.tasks.api import Score, World
 from dreamfleet.worker.tasks.registry import find_task
 from tests.support import rough_tasks, tasks
 from tests.support.processes import call_here
+from tests.support.variants import controller_of
 
 SEEDS = (10_000, 10_001, 10_002)
+HALTING, POISONED, RAISING, WEARING = (
+    rough_tasks.name_of(getattr(rough_tasks, name)) for name in ("Halting", "Poisoned", "Raising", "Wearing")
+)
 
 
 @pytest.fixture
-def controller(random_bundle):
-    def make(task=tasks.TOY):
-        shape = random_bundle.controller_shape
-        parameters = np.random.default_rng(0).normal(size=shape.size).astype(np.float32)
-        return Controller(shape, parameters, task, random_bundle.sha256)
-
-    return make
+def agent(random_bundle):
+    return lambda task: make_agent(controller_of(random_bundle, task), random_bundle)
 
 
-def test_scores_are_those_of_the_evaluation_environment(controller, random_bundle):
-    task = find_task(tasks.JUDGED)
+@pytest.fixture
+def words(random_bundle, tmp_path):
+    """The words that evaluate a controller of a task."""
+
+    def of(task, *more):
+        controller_of(random_bundle, task).save(tmp_path / "toy.npz")
+        return "evaluate", "--controller", tmp_path / "toy.npz", "--bundle", random_bundle.path, *more
+
+    return of
+
+
+def test_scores_are_those_of_the_evaluation_environment(agent):
+    judged, task = agent(tasks.JUDGED), find_task(tasks.JUDGED)
+    environment, policy = task.make_evaluation_environment(None), task.make_policy(None)
     alone = {
-        seed: episode.score(
-            task.make_evaluation_environment(None),
-            task.make_policy(None),
-            controller().parameters,
-            EpisodeConfig(seed, 10**6),
-        ).fitness
+        seed: episode.score(environment, policy, judged.parameters, EpisodeConfig(seed, 10**6)).fitness
         for seed in SEEDS
     }
     for jobs in (1, 2):
-        drives = list(evaluate(make_agent(controller(tasks.JUDGED), random_bundle), SEEDS, jobs))
+        drives = list(evaluate(judged, SEEDS, jobs))
         assert {each.seed: each.score for each in drives} == alone
         assert {each.steps for each in drives} == {10}
 
@@ -61,177 +76,154 @@ def test_scores_are_those_of_the_evaluation_environment(controller, random_bundl
         (tasks.RAISING, DreamfleetError, "seed 10000, RuntimeError: the road has ended"),
     ],
 )
-def test_an_error_in_a_process_ends_the_evaluation_with_the_reason(controller, random_bundle, task, error, named):
+def test_an_error_in_a_process_ends_the_evaluation_with_the_reason(agent, task, error, named):
     with pytest.raises(error, match=named):
-        EpisodeResults.of(evaluate(make_agent(controller(task), random_bundle), SEEDS, 2))
+        EpisodeResults.of(evaluate(agent(task), SEEDS, 2))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_an_episode_that_fails_is_reported_and_the_others_go_on(processes, controller, random_bundle, tmp_path, jobs):
-    controller(tasks.BRITTLE).save(tmp_path / "toy.npz")
-    evaluation = (
-        "evaluate", "--controller", tmp_path / "toy.npz", "--bundle", random_bundle.path, "--episodes", 30, "--jobs",
-        jobs, "--out", tmp_path / "toy.json",
-    )  # fmt: skip
-    code, out, err = processes.call(*evaluation)
-    report = read_evaluation_report(tmp_path / "toy.json")
-    failed = len(report.failed)
-    assert (code, 0 < failed < 30, len(report.drives) + failed) == (0, True, 30), err
-    assert f"seed {report.failed[0].seed}, ArithmeticError: the" in out
-    assert "Traceback" not in err
-    for each in report.failed:
-        assert f"seed {each.seed}, ArithmeticError: the world of" in err
-    plain = json.loads((tmp_path / "toy.json").read_text())
+def test_an_episode_that_fails_is_reported_and_the_others_go_on(words, random_bundle, tmp_path):
+    out = tmp_path / "toy.json"
+    code, said, err = call_here(*words(tasks.BRITTLE, "--episodes", 30, "--jobs", 2, "--out", out))
+    report, plain = read_evaluation_report(out), json.loads(out.read_text())
+    failed = [each.seed for each in report.failed]
+    assert (code, 0 < len(failed) < 30, len(report.drives) + len(failed)) == (0, True, 30), err
+    assert f"seed {failed[0]}, ArithmeticError: the" in said
+    assert all(f"seed {seed}, ArithmeticError: the world of" in err for seed in failed)
     assert plain["mean"] == pytest.approx(np.mean([each["score"] for each in plain["drives"]]))
-    assert (plain["n"], [each["seed"] for each in plain["failed"]]) == (
-        30 - failed,
-        [each.seed for each in report.failed],
-    )
-    code, out, err = call_here(
-        "verify", "report", tmp_path / "toy.json", "--bundle", random_bundle.path, "--jobs", jobs
-    )
-    assert (code, f"{30 - failed} bit-identical scores" in out) == (0, True), err
+    assert (plain["n"], [each["seed"] for each in plain["failed"]]) == (30 - len(failed), failed)
+    code, said, err = call_here("verify", "report", out, "--bundle", random_bundle.path, "--jobs", 1, "--json")
+    assert (code, json.loads(said)["reproduced"]) == (0, True), err
 
 
-@pytest.mark.slow
-def test_an_evaluation_without_any_score_ends_with_one_line(processes, controller, random_bundle, tmp_path):
-    controller(tasks.NAN).save(tmp_path / "toy.npz")
-    code, out, err = processes.call(
-        "evaluate", "--controller", tmp_path / "toy.npz", "--bundle", random_bundle.path, "--episodes", 5, "--jobs", 1
-    )
-    assert (code, out, "Traceback" in err) == (1, "", False)
-    assert "seed 10000, ValueError: " in err
-
-
-def test_a_crash_costs_only_its_own_episode(controller, random_bundle):
-    found = EpisodeResults.of(evaluate(make_agent(controller(tasks.FRAGILE), random_bundle), tuple(range(8)), 2))
-    assert [each.seed for each in found.failed] == [6]
-    assert len(found.drives) == 7
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("poison", ["fail", "segfault"])
-def test_an_episode_fails_only_in_a_fresh_process(controller, random_bundle, monkeypatch, poison):
-    monkeypatch.setenv(rough_tasks.POISON, poison)
-    agent = make_agent(controller(rough_tasks.name_of(rough_tasks.Poisoned)), random_bundle)
-    alone, beside = (EpisodeResults.of(evaluate_in_processes(agent, tuple(range(4)), jobs)) for jobs in (1, 2))
-    assert (len(alone.drives), alone.failed) == (4, ())
-    assert sorted(alone.drives, key=lambda each: each.seed) == sorted(beside.drives, key=lambda each: each.seed)
-
-
-def test_in_the_own_process_an_episode_fails_only_in_a_fresh_environment(controller, random_bundle):
-    agent = make_agent(controller(rough_tasks.name_of(rough_tasks.Wearing)), random_bundle)
-    assert len(EpisodeResults.of(evaluate(agent, tuple(range(4)), 1)).drives) == 4
-
-
-@pytest.mark.parametrize("error", ["KeyboardInterrupt", "GeneratorExit"])
-def test_what_only_python_itself_should_raise_is_an_episodes_failure(
-    processes, controller, random_bundle, tmp_path, monkeypatch, error
-):
+@pytest.mark.parametrize(
+    ("task", "error"),
+    [(tasks.NAN, "ValueError"), (RAISING, "KeyboardInterrupt"), (RAISING, "GeneratorExit")],
+)
+def test_an_evaluation_without_any_score_ends_with_one_line(words, monkeypatch, task, error):
     monkeypatch.setenv(rough_tasks.PLACE, "step")
     monkeypatch.setenv(rough_tasks.ERROR, error)
-    controller(rough_tasks.name_of(rough_tasks.Raising)).save(tmp_path / "toy.npz")
-    judged = ("--controller", tmp_path / "toy.npz", "--bundle", random_bundle.path, "--episodes", 2, "--jobs", 1)
-    code, out, err = processes.call("evaluate", *judged, "--trust", rough_tasks.MODULE)
-    assert (code, out, "Traceback" in err) == (1, "", False), err
+    code, out, err = call_here(*words(task, "--episodes", 2, "--jobs", 1))
+    assert (code, out) == (1, ""), err
     assert f"seed 10000, {error}: " in err
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("poison", ["fail", "segfault"])
+def test_an_episode_fails_only_in_a_fresh_process(agent, monkeypatch, poison):
+    monkeypatch.setenv(rough_tasks.POISON, poison)
+    alone, beside = (
+        EpisodeResults.of(evaluate_in_processes(agent(POISONED), tuple(range(4)), jobs)) for jobs in (1, 2)
+    )
+    assert (len(alone.drives), alone.failed) == (4, ())
+    assert sorted(alone.drives, key=lambda each: each.seed) == sorted(beside.drives, key=lambda each: each.seed)
+
+
+def test_in_the_own_process_an_episode_fails_only_in_a_fresh_environment(agent):
+    assert len(EpisodeResults.of(evaluate(agent(WEARING), tuple(range(4)), 1)).drives) == 4
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_an_episode_that_hangs_is_given_up_and_the_others_go_on(controller, random_bundle, monkeypatch, jobs):
+def test_an_episode_that_crashes_or_hangs_is_given_up_and_the_others_go_on(agent, monkeypatch, jobs):
+    monkeypatch.setenv(rough_tasks.EXIT, "0")
     monkeypatch.setenv(rough_tasks.HALT, "5")
-    monkeypatch.setenv(rough_tasks.EXIT, "2")
-    agent = make_agent(controller(rough_tasks.name_of(rough_tasks.Halting)), random_bundle)
-    found = EpisodeResults.of(evaluate_in_processes(agent, tuple(range(8)), jobs, stall=2.0))
+    found = EpisodeResults.of(evaluate_in_processes(agent(HALTING), tuple(range(8)), jobs, stall=2.0))
     crashed, hung = sorted(found.failed, key=lambda each: each.seed)
-    assert (crashed.seed, "exit status 3" in crashed.error, hung.seed) == (2, True, 5)
+    assert (crashed.seed, "exit status 3" in crashed.error, hung.seed) == (0, True, 5)
     assert len(found.drives) == 6
 
 
-def test_the_verb_outlives_a_simulator_that_ends_its_only_process(
-    processes, controller, random_bundle, tmp_path, monkeypatch
-):
-    monkeypatch.setenv(rough_tasks.EXIT, "10000")
-    controller(rough_tasks.name_of(rough_tasks.Halting)).save(tmp_path / "toy.npz")
-    judged = ("--controller", tmp_path / "toy.npz", "--bundle", random_bundle.path, "--episodes", 3, "--jobs", 1)
-    code, out, err = processes.call("evaluate", *judged, "--trust", rough_tasks.MODULE)
-    assert (code, "seed 10000" in out, "exit status 3" in out) == (0, True, True), err
-
-
-def test_an_interrupted_evaluation_says_what_it_has(processes, controller, random_bundle, tmp_path, monkeypatch):
+def test_an_interrupted_evaluation_says_what_it_has(processes, words, monkeypatch):
     monkeypatch.setenv(rough_tasks.EXIT, "10003")
     monkeypatch.setenv(rough_tasks.HALT, "10004")
-    controller(rough_tasks.name_of(rough_tasks.Halting)).save(tmp_path / "toy.npz")
-    judged = ("--controller", tmp_path / "toy.npz", "--bundle", random_bundle.path, "--episodes", 5, "--jobs", 1)
-    evaluation = processes.start("evaluate", *judged, "--trust", rough_tasks.MODULE)
+    evaluation = processes.start(*words(HALTING, "--episodes", 5, "--jobs", 1), "--trust", rough_tasks.MODULE)
     evaluation.wait_for("seed 10003")
     os.killpg(evaluation.popen.pid, signal.SIGINT)  # as a terminal does
     assert evaluation.finish()[0] == 130
     assert re.search(r"\b3 .*\b5 .*-\d.*±", evaluation.last_line()), evaluation.last_line()
 
 
-def test_a_world_model_is_found_beside_its_controller_or_by_name(controller, random_bundle):
-    assert find_bundle_of(controller(), str(random_bundle.path)).sha256 == random_bundle.sha256
-    assert find_bundle_of(controller(), None, random_bundle.path).sha256 == random_bundle.sha256
+def test_a_world_model_that_fits_is_found_beside_its_controller_or_by_name(random_bundle):
+    controller = controller_of(random_bundle)
+    for named in ((str(random_bundle.path),), (None, random_bundle.path)):
+        assert find_bundle_of(controller, *named).sha256 == random_bundle.sha256
     with pytest.raises(BundleError):
-        find_bundle_of(replace(controller(), bundle="ab" * 32), None, random_bundle.path)
+        find_bundle_of(replace(controller, bundle="ab" * 32), None, random_bundle.path)
     with pytest.raises(BundleError, match="--bundle"):
-        find_bundle_of(controller(), None)
-
-
-def test_a_controller_that_does_not_fit_is_refused(random_bundle):
-    small = Controller(type(random_bundle.controller_shape)(4, 3), np.zeros(15, np.float32), "car-racing", "ab" * 32)
+        find_bundle_of(controller, None)
+    small = Controller(ControllerShape(4, 3), np.zeros(15, np.float32), "car-racing", "ab" * 32)
     with pytest.raises(ControllerError, match="15"):
         find_bundle_of(small, str(random_bundle.path))
 
 
-def test_the_verb_reports_every_score_and_warns_about_tracks_outside_the_test_set(
-    processes, controller, random_bundle, tmp_path
-):
-    controller().save(tmp_path / "toy.npz")
-    code, out, err = processes.call(
-        "evaluate", "--controller", tmp_path / "toy.npz", "--bundle", random_bundle.path, "--episodes", 2,
-        "--first-seed", 9_999, "--jobs", 1, "--json",
-    )  # fmt: skip
-    report = json.loads(out)
-    assert code == 0
-    assert "19999" in err
-    assert report["seeds"] == [9_999, 10_000]
-    assert report["mean"] == pytest.approx(sum(report["scores"]) / 2)
-    assert (report["task"], report["bundle"]) == (tasks.TOY, random_bundle.sha256)
-
-
 @pytest.mark.slow
-def test_the_report_is_what_it_prints_and_can_be_repeated_to_the_bit(processes, controller, random_bundle, tmp_path):
-    controller().save(tmp_path / "toy.npz")
+def test_the_report_is_what_it_prints_and_can_be_repeated_to_the_bit(random_bundle, tmp_path):
+    controller = controller_of(random_bundle, tasks.TOY)
+    controller.save(tmp_path / "toy.npz")
     (tmp_path / "bundle.zip").write_bytes(random_bundle.path.read_bytes())
-    out = tmp_path / "results" / "toy.json"
-    judged = ("evaluate", "--controller", tmp_path / "toy.npz", "--episodes", 3, "--jobs", 1, "--out", out)
-    code, said, err = processes.call(*judged, "--json")
-    assert code == 0, err
-    assert json.loads(said) == json.loads(out.read_text())
-    recorded = read_evaluation_report(out)
-    assert (recorded.controller, recorded.bundle) == (controller().sha256, random_bundle.sha256)
+    out, flags = tmp_path / "results" / "toy.json", ("--first-seed", 9_999, "--episodes", 3, "--jobs", 1, "--json")
+    code, said, err = call_here("evaluate", "--controller", tmp_path / "toy.npz", "--out", out, *flags)
+    assert (code, "19999" in err) == (0, True), "the first seed is none of the test set's"
+    printed, recorded = json.loads(said), read_evaluation_report(out)
+    assert printed == json.loads(out.read_text())
+    assert (printed["seeds"], printed["mean"]) == ([9_999, 10_000, 10_001], pytest.approx(np.mean(printed["scores"])))
+    assert (recorded.controller, recorded.bundle) == (controller.sha256, random_bundle.sha256)
     assert (recorded.task, recorded.world, recorded.threshold) == (tasks.TOY, tasks.TOY, None)
     assert recorded.fingerprint == fingerprint(find_task(tasks.TOY).world.packages)
     assert [each.finished for each in recorded.drives] == [None] * 3
-    code, said, err = call_here("verify", "report", out, "--episodes", 2, "--jobs", 1)
-    assert (code, "2 bit-identical scores" in said) == (0, True), err
-    out.write_text(replace(recorded, drives=(replace(recorded.drives[0], steps=9), *recorded.drives[1:])).to_json())
-    code, said, err = call_here("verify", "report", out, "--jobs", 1, "--json")
-    assert (code, json.loads(said)["reproduced"]) == (1, False), err
-    out.write_text(replace(recorded, controller="ef" * 32).to_json())
-    code, _, err = call_here("verify", "report", out)
-    assert (code, "efefefefefef" in err) == (1, True)
-    out.write_text(replace(recorded, bundle="ef" * 32).to_json())
-    code, _, err = call_here("verify", "report", out)
-    assert (code, "efefefefefef" in err) == (1, True)
+
+    def verified(report, *more):
+        out.write_text(report.to_json())
+        code, said, err = call_here("verify", "report", out, "--jobs", 1, "--json", *more)
+        return code, said and json.loads(said)["reproduced"], err
+
+    assert verified(recorded, "--episodes", 2)[:2] == (0, True)
+    first, *others = recorded.drives
+    assert verified(replace(recorded, drives=(replace(first, steps=9), *others)))[:2] == (1, False)
+    for other in (replace(recorded, controller="ef" * 32), replace(recorded, bundle="ef" * 32)):
+        code, _, err = verified(other)
+        assert (code, "efefefefefef" in err) == (1, True)
 
 
-def test_an_unwritable_report_is_an_error_before_the_first_episode(processes, controller, random_bundle, tmp_path):
-    controller(tasks.HANGING).save(tmp_path / "toy.npz")
-    judged = ("evaluate", "--controller", tmp_path / "toy.npz", "--bundle", random_bundle.path, "--out", tmp_path)
-    code, _, err = call_here(*judged)
+def test_an_unwritable_report_is_an_error_before_the_first_episode(words, tmp_path):
+    code, _, err = call_here(*words(tasks.HANGING, "--out", tmp_path))
     assert (code, str(tmp_path) in err) == (2, True)
+
+
+@pytest.mark.parametrize("task", ["car-racing", "dream"])
+def test_it_reports_speed_and_brake_of_a_drive_that_is_the_same_unwatched(monkeypatch, tmp_path, task):
+    monkeypatch.setattr(evaluation, "EpisodeConfig", lambda seed, _horizon: EpisodeConfig(seed, 12))
+    controller = find_controller("tiny", tmp_path)[0]
+    parameters = controller.parameters.copy()
+    parameters[2 * 288 : 3 * 288], parameters[-1] = 0.0, 5.0  # the brake's weights and bias: it is always on
+    agent = make_agent(replace(controller, parameters=parameters, task=task), find_bundle("tiny"))
+    judge, unwatched = AgentEvaluator(agent), agent.make_evaluation_environment()
+    drive = judge.drive(SEEDS[0])
+    alone = episode.score(unwatched, agent.make_policies()(SEEDS[0]), parameters, EpisodeConfig(SEEDS[0], 12))
+    judge.close()
+    unwatched.close()
+    assert (drive.seed, drive.score, drive.steps) == (SEEDS[0], alone.fitness, 12)
+    assert (drive.finished, drive.braking) == (False, 1.0)
+    assert 0 <= drive.speed < 20
+
+
+def moment(info):
+    return Transition(None, np.zeros(3), 1.0, 1, bool(info), False, info)
+
+
+def test_a_world_without_a_true_state_has_no_statistics():
+    watch = DriveStatistics(World(STEERING_GAS_BRAKE, action_names=("steer", "gas", "brake")), None)
+    watch.on_transition(moment({"lap_finished": True}))
+    assert watch.drive(3, Score(5.0, 1)) == EpisodeResult(3, 5.0, 1)
+
+
+@pytest.mark.parametrize(
+    ("last", "finished"), [({"lap_finished": True}, True), ({"lap_finished": False}, False), ({}, False)]
+)
+def test_a_lap_is_finished_if_the_environment_says_so_at_the_end(last, finished):
+    watch = DriveStatistics(find_task("car-racing").world, lambda: {"speed": 30.0})
+    for info in ({}, last):
+        watch.on_transition(moment(info))
+    drive = watch.drive(1, Score(900.0, 2))
+    assert (drive.finished, drive.speed, drive.braking) == (finished, 30.0, 0.0)

@@ -65,30 +65,28 @@ def test_a_dreamt_picture_and_its_label_fit_into_the_frame(since):
     assert (frame[-MARGIN:] == BACKGROUND).all()
 
 
-def bar(action, actions, names=("push",)):
-    """The columns of the first bar that are filled, of its 106."""
+def span(low, high):
+    return Continuous.between([low], [high])
+
+
+@pytest.mark.parametrize(
+    ("actions", "action", "filled"),
+    [
+        (span(-1, 1), [0.5], range(53, 79)), (span(-1, 1), [-1], range(53)), (span(-2, 2), [1.0], range(53, 79)),
+        (span(0, 1), [0.5], range(53)), (span(0, 4), [1.0], range(26)), (span(1, 3), [2.0], range(53)),
+        (span(0, 1), [9.0], range(106)), (span(-0.5, 2), [2], range(53, 106)),
+        (STEERING_GAS_BRAKE, [0.5, 0.5, 0.0], range(53, 79)),
+    ],
+)  # fmt: skip
+def test_a_bar_is_as_long_as_its_value_between_its_bounds(actions, action, filled):
+    names = ("push", "gas", "brake")[: len(action)]
     frame = Canvas(SEED, WORLD, names=names, actions=actions).draw(
         DriveFrame(plain(RED), np.array(action, np.float32), 0, 0.0)
     )
     width, height = DREAMING.track
     left = width + 16 - len(action) * 122
     row = frame[height + 26 + 22 + 7, left : left + 106]
-    return np.flatnonzero((row == (120, 170, 255)).all(axis=1)).tolist()
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "value", "filled"),
-    [
-        (-1, 1, 0.5, range(53, 79)), (-1, 1, -1, range(53)), (-2, 2, 1.0, range(53, 79)), (0, 1, 0.5, range(53)),
-        (0, 4, 1.0, range(26)), (1, 3, 2.0, range(53)), (0, 1, 9.0, range(106)), (-0.5, 2, 2, range(53, 106)),
-    ],
-)  # fmt: skip
-def test_a_bar_is_as_long_as_its_value_between_its_bounds(low, high, value, filled):
-    assert bar([value], Continuous.between([low], [high])) == list(filled)
-
-
-def test_the_cars_bars_need_no_names_of_pedals():
-    assert bar([0.5, 0.5, 0.0], STEERING_GAS_BRAKE, ("steer", "gas", "brake")) == list(range(53, 79))
+    assert np.flatnonzero((row == (120, 170, 255)).all(axis=1)).tolist() == list(filled)
 
 
 @pytest.mark.parametrize(

@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.car_racing_variants import DEFAULT_VARIANT, Variant
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
 from dreamfleet.worker.addons.refit import refit_verb as verb
-from dreamfleet.worker.addons.refit.drive_regression import DriveArrays, FeatureExtractor, LeastSquaresSums
+from dreamfleet.worker.addons.refit.drive_regression import FeatureExtractor, LeastSquaresSums, load_in_batches
 from dreamfleet.worker.addons.refit.refit import output_bounds, refit
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -48,13 +47,10 @@ def controller(bundle, features="zh", hidden=0, variant=DEFAULT_VARIANT):
 
 def first_values(chosen, bundle, paths):
     """The outputs of its first layer along drives `(N, T, outputs)`."""
-    with_pictures = []
-    for path in paths:
-        with np.load(path) as drive:
-            with_pictures.append(DriveArrays(drive["picture"], drive["action"], drive["reward"]))
+    ((_, drives),) = load_in_batches(paths, 3)
     looking = FeatureExtractor(bundle.for_controller(chosen))
     (weights, biases), *_ = chosen.shape.unpack(chosen.parameters)
-    values = looking.features(with_pictures, looking.encode_drives(with_pictures)) @ weights.T + biases
+    values = looking.features(drives, looking.encode_drives(drives)) @ weights.T + biases
     return np.clip(values, *output_bounds(chosen, bundle))
 
 
@@ -67,9 +63,7 @@ def test_what_lies_behind_an_actions_bound_is_kept_near_it(bundles):
         assert (set(lowest), set(highest)) == ({-2.5}, {2.5})
     for actions in ("discrete", "linear"):
         unbounded = output_bounds(controller(bundles[0], variant=Variant(actions=actions)), bundles[0])
-        assert np.isinf(unbounded).all(), (
-            "values that are compared, or are the action, mean something wherever they lie"
-        )
+        assert np.isinf(unbounded).all(), "values that are compared, or are the action"
 
 
 @pytest.mark.parametrize("features", ["z", "zh"])
@@ -85,11 +79,8 @@ def test_it_chooses_by_other_eyes_much_as_it_chose(bundles, drives, features, hi
     assert found.drives == 16
     assert 16 * 55 < found.steps < 16 * 60  # nothing is known behind a drive's last reward
     assert counts == [16]
-    for (above, offsets), (same, unchanged) in zip(
-        before.shape.unpack(before.parameters)[1:], after.shape.unpack(after.parameters)[1:], strict=True
-    ):
-        assert (above == same).all()
-        assert (offsets == unchanged).all()
+    upper, same = (each.shape.unpack(each.parameters)[1:] for each in (before, after))
+    assert all(all(map(np.array_equal, *layers)) for layers in zip(upper, same, strict=True))
     wanted = first_values(before, old, drives[16:])
     fitted, moved = (first_values(each, new, drives[16:]) for each in (after, replace(before, bundle=new.sha256)))
     assert np.square(fitted - wanted).mean() < 0.2 * np.square(moved - wanted).mean()
@@ -114,43 +105,41 @@ def test_least_squares_find_a_map_and_how_much_it_explains():
     assert np.isnan(LeastSquaresSums.of(inputs, np.ones((200, 1))).r_squared(np.zeros((4, 1)))).all()
 
 
-def test_what_cannot_be_fitted_is_refused(bundles, drives, folder, tmp_path):
+def test_what_cannot_be_fitted_is_refused(bundles, drives, tmp_path):
     old, new = bundles
     with pytest.raises(UsageError):
         refit(controller(old, variant=Variant(feedback="last")), old, new, drives, ignore)
-    wide = write_random_bundle(tmp_path / "wide.zip", 1, VAEConfig(latent=4, picture=96, channels=(2, 2, 2, 2)), MEMORY)
+    wide = write_random_bundle(tmp_path / "wide.zip", 1, replace(EYES, picture=96), MEMORY)
     with pytest.raises(ControllerError):
         refit(controller(old), old, wide, drives, ignore)
-    other = write_drive(tmp_path, 0, picture=96)
-    with pytest.raises(DatasetError):
-        refit(controller(old), old, new, [other], ignore)
-    lost = write_drive(tmp_path, 1)
-    with np.load(lost) as drive:
-        arrays = dict(drive)
-    np.savez(lost, **{**arrays, "reward": np.full_like(arrays["reward"], -0.1)})
-    with pytest.raises(UsageError):
-        refit(controller(old), old, new, [lost], ignore)
-    for action in (arrays["action"][:, :2], np.full_like(arrays["action"], np.nan)):
-        np.savez(lost, **{**arrays, "action": action})
-        with pytest.raises(DatasetError):
-            refit(controller(old), old, new, [lost], ignore)
-    np.savez(lost, **{**arrays, "picture": arrays["picture"][1:]})
-    with pytest.raises(DatasetError):
-        refit(controller(old), old, new, [lost], ignore)
+    for error, changed in (
+        (DatasetError, {"picture": 96}),
+        (DatasetError, {"pictures": np.zeros((11, 64, 64, 3), np.uint8)}),
+        (DatasetError, {"actions": 2}),
+        (DatasetError, {"action": np.full((12, 3), np.nan, np.float32)}),
+        (UsageError, {"reward": np.full(12, -0.1, np.float32)}),  # it is lost from the first step on
+    ):
+        with pytest.raises(error):
+            refit(controller(old), old, new, [write_drive(tmp_path, 0, **changed)], ignore)
 
 
 def test_the_verb_writes_a_controller_of_the_other_model(bundles, drives, folder, tmp_path, capsys):
     old, new = bundles
     controller(old).save(tmp_path / "before.npz")
-    flags = ("--bundle", old.path, "--data", folder / "data", "--out", tmp_path / "after.npz", "--runs-dir", tmp_path)
-    assert run_verb(verb, tmp_path / "before.npz", "--to", new.path, *flags, "--episodes", 10, "--json") == 0
-    printed = json.loads(capsys.readouterr().out)
-    after = Controller.load(tmp_path / "after.npz")
-    assert (printed["sha256"], printed["bundle"], printed["drives"]) == (after.sha256, Bundle.open(new.path).sha256, 10)
+
+    def call(*more):
+        return run_verb(
+            verb, tmp_path / "before.npz", "--to", new.path, "--bundle", old.path, "--data", folder / "data", "--out",
+            tmp_path / "after.npz", "--runs-dir", tmp_path, *more,
+        )  # fmt: skip
+
+    assert call("--episodes", 10, "--json") == 0
+    printed, after = json.loads(capsys.readouterr().out), Controller.load(tmp_path / "after.npz")
+    assert (printed["sha256"], printed["bundle"], printed["drives"]) == (after.sha256, new.sha256, 10)
     assert len(printed["r_squared"]) == 3
     with pytest.raises(UsageError, match="--episodes"):
-        run_verb(verb, tmp_path / "before.npz", "--to", new.path, *flags, "--episodes", 1)
+        call("--episodes", 1)
     with pytest.raises(UsageError):
-        run_verb(verb, tmp_path / "before.npz", "--to", new.path, *flags, "--out", tmp_path)
+        call("--out", tmp_path)
     with pytest.raises(ControllerError):
-        run_verb(verb, tmp_path / "before.npz", "--to", new.path, *flags, "--bundle", new.path)
+        call("--bundle", new.path)

@@ -15,14 +15,19 @@ from tests.support.processes import call_here
 
 
 @pytest.fixture
-def finished_run(processes, random_bundle):
-    coordinator = processes.coordinator(
-        "--bundle", random_bundle.path, "--task", tasks.TOY, "--population", 4, "--episodes", 2, "--generations", 1,
-        "--evaluate-every", 0,
-    )  # fmt: skip
-    processes.worker("--task", tasks.TOY, "--exit-when-done")
-    assert coordinator.finish()[0] == 0
-    return processes.runs / "test"
+def begin(processes, random_bundle):
+    """Score a run of one generation; its folder."""
+
+    def begun(task, *flags, population=4, episodes=2):
+        coordinator = processes.coordinator(
+            "--bundle", random_bundle.path, "--task", task, "--population", population, "--episodes", episodes,
+            "--generations", 1, "--evaluate-every", 0, *flags,
+        )  # fmt: skip
+        processes.worker("--task", task, "--exit-when-done")
+        assert coordinator.finish()[0] == 0
+        return processes.runs / "test"
+
+    return begun
 
 
 def verify(processes, candidate, *flags):
@@ -44,9 +49,8 @@ def change(folder, statement, *values):
 
 
 @pytest.mark.slow
-def test_another_fitness_exits_1_and_one_of_another_host_class_is_counted_and_optionally_compared(
-    processes, finished_run
-):
+def test_another_fitness_exits_1_and_one_of_another_host_class_is_counted_and_optionally_compared(processes, begin):
+    finished_run = begin(tasks.TOY)
     code, found, _ = verify(processes, "0/1", "--json")
     assert (code, found["identical"], found["unchecked"], same(found)) == (0, True, 0, [True, True])
     change(finished_run, "UPDATE result SET fitness = fitness + 1e-9 WHERE candidate = 1 AND episode = 1")
@@ -62,61 +66,40 @@ def test_another_fitness_exits_1_and_one_of_another_host_class_is_counted_and_op
     assert verify(processes, "0/1", "--tolerance", 0.25)[0] == 1
 
 
-def score_generation(processes, bundle, task, episodes):
-    """A run of one generation, to its end."""
-    coordinator = processes.coordinator(
-        "--bundle", bundle.path, "--task", task, "--population", 4, "--episodes", episodes, "--generations", 1,
-        "--evaluate-every", 0,
-    )  # fmt: skip
-    processes.worker("--task", task, "--exit-when-done")
-    assert coordinator.finish()[0] == 0
-
-
 @pytest.mark.slow
-def test_an_episode_that_hangs_or_ends_its_process_now_differs(processes, random_bundle, monkeypatch):
-    task = rough_tasks.name_of(rough_tasks.Halting)
-    score_generation(processes, random_bundle, task, 3)
-    with RunFolder(processes.runs / "test") as run:
+def test_an_episode_that_hangs_or_ends_its_process_now_differs(begin, monkeypatch):
+    with RunFolder(begin(rough_tasks.name_of(rough_tasks.Halting), episodes=3)) as run:
         seeds = [each.seed for each in run.results(0, 1)]
         monkeypatch.setenv(rough_tasks.HALT, str(seeds[0]))
         monkeypatch.setenv(rough_tasks.EXIT, str(seeds[1]))
-        monkeypatch.setenv("DREAMFLEET_TRUST", rough_tasks.MODULE)
         hung, crashed, sound = replay(run, 0, 1, stall=2.0)
     assert (hung.error.kind, crashed.error) == ("crash", crash(3))
     assert (hung.agrees(None), crashed.agrees(None), sound.agrees(None)) == (False, False, True)
 
 
 @pytest.mark.slow
-def test_an_episode_fails_only_in_a_fresh_process(processes, random_bundle, monkeypatch):
+def test_an_episode_fails_only_in_a_fresh_process(processes, begin, monkeypatch):
     monkeypatch.setenv(rough_tasks.POISON, "fail")
-    monkeypatch.setenv("DREAMFLEET_TRUST", rough_tasks.MODULE)
-    task = rough_tasks.name_of(rough_tasks.Poisoned)
-    score_generation(processes, random_bundle, task, 2)
+    begin(rough_tasks.name_of(rough_tasks.Poisoned))
     code, found, err = verify(processes, "0/1", "--json")
     assert (code, same(found)) == (0, [True, True]), err
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("place", [pytest.param("make", marks=pytest.mark.long), "step"])
-def test_what_only_python_itself_should_raise_is_an_episodes_failure(processes, random_bundle, monkeypatch, place):
-    task = rough_tasks.name_of(rough_tasks.Raising)
-    score_generation(processes, random_bundle, task, 2)
+def test_what_only_python_itself_should_raise_is_an_episodes_failure(processes, begin, monkeypatch, place):
+    begin(rough_tasks.name_of(rough_tasks.Raising))
     monkeypatch.setenv(rough_tasks.PLACE, place)
     monkeypatch.setenv(rough_tasks.ERROR, "KeyboardInterrupt")
-    code, out, err = verify(processes, "0/1", "--trust", rough_tasks.MODULE)
+    code, out, err = verify(processes, "0/1")
     assert (code, out.count("(KeyboardInterrupt")) == (1, 2), (out, err)
 
 
 @pytest.fixture
-def brittle_run(processes, random_bundle):
+def brittle_run(begin):
     def run(on_failure, seed=7, population=12):
-        coordinator = processes.coordinator(
-            "--bundle", random_bundle.path, "--task", tasks.BRITTLE, "--population", population, "--episodes", 3,
-            "--generations", 1, "--evaluate-every", 0, "--seed", seed, "--on-failure", on_failure, "--failure-limit", 1,
-        )  # fmt: skip
-        processes.worker("--task", tasks.BRITTLE, "--exit-when-done")
-        assert coordinator.finish()[0] == 0
-        return processes.runs / "test"
+        flags = ("--seed", seed, "--on-failure", on_failure, "--failure-limit", 1)
+        return begin(tasks.BRITTLE, *flags, population=population, episodes=3)
 
     return run
 

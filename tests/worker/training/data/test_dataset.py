@@ -1,20 +1,28 @@
+"""The files of a data set, whole, damaged in thousands of ways, or of another kind."""
+
 import itertools
 
 import numpy as np
 import pytest
 
 from dreamfleet.common.errors import DatasetError
+from dreamfleet.worker.training.data.collect import import_rollouts
 from dreamfleet.worker.training.data.dataset import (
+    check_whole,
     episode_paths,
     load_arrays,
     load_pictures,
+    load_steps,
     pad,
     picture_batches,
     split_held_out,
 )
+from dreamfleet.worker.training.data.rollouts import load_rollouts
 from tests.support.drives import write_drive, write_drives
+from tests.support.mutations import Watched, archives
 
 NAMES = ("picture", "action", "reward", "preprocessing")
+DAMAGES = 1000
 
 
 @pytest.mark.parametrize("kind", ["episodes", "encoded"])
@@ -39,20 +47,43 @@ def test_whole_episodes_are_held_out(tmp_path):
     paths = [tmp_path / f"{number:06d}.npz" for number in range(45)]
     train, held_out = split_held_out(paths)
     assert sorted(train + held_out) == paths
-    assert not set(train) & set(held_out)
     assert held_out == [paths[0], paths[20], paths[40]]
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
-def test_a_truncated_episode_is_refused(tmp_path, share):
-    path = write_drive(tmp_path, 0)
-    data = path.read_bytes()
-    path.write_bytes(data[: int(len(data) * share)])
-    with pytest.raises(DatasetError):
-        load_arrays(path, *NAMES)
+@pytest.fixture
+def watched():
+    made = Watched()
+    yield made
+    made.check()
 
 
-def test_no_damage_to_any_byte_raises_another_kind_of_error(tmp_path):
+@pytest.mark.slow
+def test_damaged_drives_are_read_or_refused_in_one_line(tmp_path, watched):
+    def read():
+        check_whole([path], "picture", "action")
+        assert len(load_pictures(path)) > 0
+        assert len(load_steps(path)["reward"]) > 0
+        load_arrays(path, "driver")
+
+    path, count = write_drive(tmp_path, 0, steps=3), 0
+    for data in archives(path.read_bytes(), DAMAGES, seed=6):
+        path.write_bytes(data)
+        count += watched.read(DatasetError, read)
+    assert 0 < count < DAMAGES
+
+
+def test_damaged_encoded_drives_are_read_or_refused_in_one_line(tmp_path, watched):
+    path, count = tmp_path / "e.npz", 0
+    names = ("mu", "logvar", "mirrored_mu", "mirrored_logvar")
+    latents = dict.fromkeys(names, np.zeros((5, 4), np.float32))
+    np.savez(path, **latents, action=np.zeros((5, 3), np.float32), reward=np.zeros(5, np.float32), ended=np.array(True))
+    for data in archives(path.read_bytes(), DAMAGES, seed=7):
+        path.write_bytes(data)
+        count += watched.read(DatasetError, lambda: load_rollouts([path], np.array([True])))
+    assert 0 < count < DAMAGES
+
+
+def test_what_is_read_of_a_damaged_drive_is_whole(tmp_path):
     path = write_drive(tmp_path, 0, steps=2)
     whole, data = load_arrays(path, *NAMES), path.read_bytes()
     for position in range(0, len(data), 13):
@@ -67,45 +98,69 @@ def test_no_damage_to_any_byte_raises_another_kind_of_error(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "changed",
+    [
+        {"picture": np.zeros((4, 64, 64, 3), np.float32)},
+        {"picture": np.zeros((4, 32, 64, 3), np.uint8)},
+        {"picture": np.zeros((), np.uint8)},
+        {"picture": np.zeros((5, 64, 64, 3), np.uint8)},
+        {"action": np.zeros((4, 3), np.int64)},
+        {"action": np.zeros(4, np.float32)},
+        {"action": np.zeros((3, 3), np.float32)},
+        {"action": np.array([["a"] * 3] * 4)},
+        {"reward": np.zeros((4, 1), np.float32)},
+        {"reward": np.zeros(0, np.float32)},
+        {"ended": np.zeros(4, bool)},
+        {"ended": np.array("yes")},
+        {"preprocessing": np.zeros(3)},
+        None,
+    ],
+)
+def test_a_drive_of_another_kind_is_never_taken_in(tmp_path, changed):
+    path = write_drive(tmp_path / "sent", 0, steps=4)
+    if changed is None:
+        path.write_bytes(b"no drive")
+    else:
+        np.savez(path, **{**np.load(path), **changed})
+    with pytest.raises(DatasetError, match=str(path)):
+        list(import_rollouts(tmp_path / "data", [path]))
+    assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize(
     "changes",
     [
         {"preprocessing": np.array("bilinear-64")},
-        {"picture": np.zeros((4, 96, 96, 3), np.uint8)},
-        {"picture": np.zeros((0, 64, 64, 3), np.uint8)},
+        {"pictures": np.zeros((4, 96, 96, 3), np.uint8)},
+        {"pictures": np.zeros((0, 64, 64, 3), np.uint8)},
     ],
 )
 def test_pictures_of_another_kind_are_refused(tmp_path, changes):
-    path = write_drive(tmp_path, 0)
-    np.savez_compressed(path, **{**load_arrays(path, *NAMES), **changes})
     with pytest.raises(DatasetError):
-        load_pictures(path)
+        load_pictures(write_drive(tmp_path, 0, **changes))
 
 
-def test_batches_are_a_pure_function_of_seed_and_pool(tmp_path):
-    paths = write_drives(tmp_path)
-
-    def first(seed, pool):
-        return next(picture_batches(paths, 16, seed, pool))[-1]
-
-    assert np.array_equal(first(0, 0), first(0, 0))
-    assert not np.array_equal(first(0, 0), first(1, 0))
-    assert not np.array_equal(first(0, 0), first(0, 1))
+@pytest.fixture
+def paths(tmp_path):
+    return write_drives(tmp_path)
 
 
-def test_a_pool_shows_no_picture_twice(tmp_path):
-    paths = write_drives(tmp_path)
-    batches = itertools.takewhile(lambda each: each[0] == 0, picture_batches(paths, 16, seed=0))
-    pictures = np.concatenate([batch for _, _, batch in batches])
-    assert len(np.unique(pictures.reshape(len(pictures), -1), axis=0)) == len(pictures)
-
-
-def test_batches_go_on_behind_any_of_them(tmp_path):
-    paths = write_drives(tmp_path)
+def test_batches_are_a_pure_function_of_seed_and_pool_and_go_on_behind_any_of_them(paths):
     batches = list(itertools.islice(picture_batches(paths, 16, 0), 9))
     for index, (pool, taken, _) in enumerate(batches[:-1]):
         behind = next(picture_batches(paths, 16, 0, pool, taken))
         assert behind[:2] == batches[index + 1][:2]
         assert np.array_equal(behind[2], batches[index + 1][2])
+    first = batches[0][2]
+    assert np.array_equal(first, next(picture_batches(paths, 16, 0, 0))[2])
+    for seed, pool in ((1, 0), (0, 1)):
+        assert not np.array_equal(first, next(picture_batches(paths, 16, seed, pool))[2])
+
+
+def test_a_pool_shows_no_picture_twice(paths):
+    batches = itertools.takewhile(lambda each: each[0] == 0, picture_batches(paths, 16, seed=0))
+    pictures = np.concatenate([batch for _, _, batch in batches])
+    assert len(np.unique(pictures.reshape(len(pictures), -1), axis=0)) == len(pictures)
 
 
 def test_fewer_pictures_than_a_batch_make_a_smaller_batch(tmp_path):
@@ -113,13 +168,11 @@ def test_fewer_pictures_than_a_batch_make_a_smaller_batch(tmp_path):
     assert [len(batch) for _, _, batch in itertools.islice(picture_batches(paths, 100, seed=0), 2)] == [5, 5]
 
 
-def test_memory_holds_a_pool_and_not_the_data_set(tmp_path, monkeypatch):
-    monkeypatch.setattr("dreamfleet.worker.training.data.dataset.POOL_EPISODES", 2)
-    loaded = []
-    monkeypatch.setattr(
-        "dreamfleet.worker.training.data.dataset.load_pictures", lambda path: loaded.append(path) or load_pictures(path)
-    )
-    next(picture_batches(write_drives(tmp_path), 4, seed=0))
+def test_memory_holds_a_pool_and_not_the_data_set(paths, monkeypatch):
+    module, loaded = "dreamfleet.worker.training.data.dataset", []
+    monkeypatch.setattr(f"{module}.POOL_EPISODES", 2)
+    monkeypatch.setattr(f"{module}.load_pictures", lambda path: loaded.append(path) or load_pictures(path))
+    next(picture_batches(paths, 4, seed=0))
     assert len(loaded) == 2
 
 
