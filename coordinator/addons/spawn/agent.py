@@ -36,10 +36,11 @@ STOP_AT_ONCE = ((signal.SIGTERM, 1.0), (signal.SIGTERM, 10.0), (signal.SIGKILL, 
 STOP_DRAINED = ((signal.SIGTERM, DRAIN_TIMEOUT),)
 LEAST_FREE = 700_000_000  # bytes needed while an environment is made
 LONGEST_TAIL = 8192  # bytes read from the end of a log for its last line
+LONGEST_LIST = 1 << 20  # bytes read of the list of folders
 JOIN, LOG, STATE, COMPLETE, CREATED = "join", "log", "worker.json", "whole", "made"
 REPORTS, REPORTS_VARIABLE = "reports", "DREAMFLEET_REPORTS"  # a worker reports there that it has begun, or failed
 FOLDERS = ("environments", "workers", "cache")  # under the root
-LOCK = "lock"
+LOCK, LOCK_CONTENT = "lock", b"dreamfleet\n"
 # Starts a worker only once a line says that its state is written: one that nobody knows of could not be ended.
 ONCE_KNOWN = ("/bin/sh", "-c", 'read known && exec "$@" </dev/null', "sh")
 JOIN_HERE = "{join}"  # placeholder for the join file's path
@@ -92,7 +93,10 @@ class HostFolder:
     """The folder on this host that holds environments, workers and caches."""
 
     def __init__(self, text: str, channel: Channel) -> None:
-        self.root = Path(text).expanduser().absolute()
+        try:
+            self.root = Path(text).expanduser().absolute()
+        except RuntimeError as error:
+            raise FailedError(f"{text}: no such user there, name another --remote-dir") from error
         self.channel = channel
         self.lock = -1  # the lock's descriptor while it is held
 
@@ -103,15 +107,22 @@ class HostFolder:
 
     @property
     def is_ours(self) -> bool:
-        """Whether this program created the folder; otherwise its content belongs to somebody else.
+        """Whether this program created the folder, by what its files hold: others may have files of the same names.
 
-        One that was killed as it created or removed the folder leaves no more than the lock and a file half written.
+        One that was killed as it created or removed the folder leaves no more than the lock or a file half written.
         """
-        if (self.root / CREATED).exists() or any(self.root.glob(f"workers/*/{STATE}")):
+        if self._listed() is not None or any(WorkerProcess(self.worker(each)).state for each in self.names("workers")):
             return True
-        found = list(self.root.iterdir()) if self.root.is_dir() else []
-        mere = (aside(self.root / CREATED), *(each for each in found if each.name == LOCK and not each.stat().st_size))
-        return bool(found) and all(each in mere for each in found)
+        found = {each.name for each in self.root.iterdir()} if self.root.is_dir() else set()
+        begun, lock = aside(self.root / CREATED), self.root / LOCK
+        return bool(found) and found <= {
+            *([begun.name] if _content(begun)[:1] in b"[" else []), *([LOCK] if _content(lock) == LOCK_CONTENT else [])
+        }  # fmt: skip
+
+    @property
+    def removal(self) -> str:
+        """A shell command that removes everything of ours."""
+        return f"cd {shlex.quote(str(self.root))} && rm -rf {' '.join((*FOLDERS, CREATED, LOCK))}"
 
     def environment(self, name: str) -> Path:
         """The folder of an environment."""
@@ -133,18 +144,29 @@ class HostFolder:
         return []
 
     @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Hold the folder's lock, which every command that changes it takes; create the folder if needed."""
+    def locked(self, *, creating: bool = True) -> Iterator[bool]:
+        """Hold the folder's lock, which every command that changes it takes.
+
+        Creates the folder if needed, or else yields False if it is not ours.
+        """
         while True:
-            self._create()
-            with self._open_lock() as lock:
+            if creating:
+                self._create()
+            elif not self.is_ours:
+                yield False
+                return
+            try:
+                lock = self._open_lock()
+            except FileNotFoundError:  # the last holder removed the folder, here and below
+                continue
+            with lock:
                 self._acquire(lock.fileno())
                 held = False
-                with suppress(FileNotFoundError):  # the last holder may have removed the folder
+                with suppress(FileNotFoundError):
                     held = os.path.samestat(os.fstat(lock.fileno()), (self.root / LOCK).stat())
-                if held:
+                if held and (not creating or (self.root / CREATED).exists()):
                     self.lock = lock.fileno()
-                    yield
+                    yield True
                     return
 
     def remove(self) -> None:
@@ -157,17 +179,29 @@ class HostFolder:
         _remove_empty(made)
 
     def _made(self) -> list[Path]:
-        """The folders that this program created, the root first; a damaged list says only that it created the root."""
-        with suppress(FileNotFoundError, ValueError, TypeError):
-            listed = {Path(each) for each in json.loads((self.root / CREATED).read_text())}
-            return [each for each in (self.root, *self.root.parents) if each in listed]
-        return [self.root]
+        """The folders that this program created, the root first; without their list, the root."""
+        listed = self._listed()
+        return [self.root] if listed is None else [
+            each for each in (self.root, *self.root.parents) if str(each) in listed
+        ]  # fmt: skip
+
+    def _listed(self) -> list[str] | None:
+        """The list of the folders that this program created; `None` if there is none, or it is not as we write it."""
+        with suppress(ValueError, RecursionError):
+            listed = json.loads(_content(self.root / CREATED))
+            if isinstance(listed, list) and all(isinstance(each, str) and each.startswith("/") for each in listed):
+                return listed
+        return None
 
     def _create(self) -> None:
         """Create the folder, with the list of folders that it took; if that fails, none of them stays."""
-        missing, ours = [each for each in (self.root, *self.root.parents) if not each.exists()], self.is_ours
-        if not ours and (strange := [each for each in FOLDERS if (self.root / each).exists()]):
+        with suppress(RuntimeError):  # this user has no home
+            if Path.home().resolve().is_relative_to(self.root.resolve()):  # people put files of their own there
+                raise FailedError(f"{self.root} is no folder of its own: name another --remote-dir")
+        before, ours = self._taken(), self.is_ours
+        if before and not ours and (strange := self._taken()):  # again: another command may remove the folder
             raise FailedError(f"{self.root} holds {strange[0]} of something else: name another --remote-dir")
+        missing = [each for each in (self.root, *self.root.parents) if not each.exists()]
         if not missing and (self.root / CREATED).exists():
             return
         try:
@@ -175,20 +209,29 @@ class HostFolder:
             made = missing or ([self.root] if ours else [])
             _write_private(self.root / CREATED, json.dumps([str(each) for each in made]).encode())
             self._open_lock().close()
+            for name in FOLDERS:  # now, so that what is in one of them later is in a folder of ours
+                (self.root / name).mkdir(exist_ok=True)
         except OSError:
             if missing:
                 for name in (CREATED, LOCK):
                     (self.root / name).unlink(missing_ok=True)
-                _remove_empty(missing)
+                _remove_empty([*(self.root / name for name in FOLDERS), *missing])
             raise
 
+    def _taken(self) -> list[str]:
+        """The names of ours that something in the folder has."""
+        return [each for each in (*FOLDERS, CREATED, LOCK) if os.path.lexists(self.root / each)]
+
     def _open_lock(self) -> BinaryIO:
-        """Open or create the lock file, whose content stays."""
+        """Open or create the lock file, whose content says that it is ours."""
         path = self.root / LOCK
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         try:
             file = open(os.open(path, flags, 0o666), "r+b", buffering=0)  # noqa: SIM115 - the caller closes it
-            if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            if stat.S_ISREG((found := os.fstat(file.fileno())).st_mode):
+                if not found.st_size:
+                    with suppress(OSError):  # a full disk must not prevent a removal
+                        file.write(LOCK_CONTENT)
                 return file
             file.close()
         except OSError as error:
@@ -209,6 +252,14 @@ class HostFolder:
 def aside(path: Path) -> Path:
     """Where a file is written before it takes its name."""
     return path.with_name(f".{path.name}")
+
+
+def _content(path: Path) -> bytes:
+    """The beginning of a regular file; empty without one."""
+    if not path.is_file():
+        return b""
+    with path.open("rb") as file:
+        return file.read(LONGEST_LIST)
 
 
 def remove_tree(folder: Path) -> None:
@@ -504,10 +555,13 @@ def end(host_folder: HostFolder, request: dict[str, Any]) -> dict[str, Any]:
     `FailedError` names those that were left alone, once the others have ended.
     """
     channel, ended, left = host_folder.channel, list[dict[str, Any]](), list[str]()
-    if not host_folder.is_ours:
-        return {"ended": ended}
-    with host_folder.locked():
-        for name in request["names"] or host_folder.names("workers"):
+    if (host_folder.root / CREATED).exists() and not host_folder.is_ours:
+        raise FailedError(
+            f"{host_folder.root / CREATED} is damaged, or of something else: if all there is dreamfleet's, remove it "
+            f"with: {host_folder.removal}"
+        )
+    with host_folder.locked(creating=False) as ours:
+        for name in (request["names"] or host_folder.names("workers")) if ours else ():
             found = WorkerProcess(host_folder.worker(name))
             if not found.folder.exists():
                 continue
@@ -521,7 +575,7 @@ def end(host_folder: HostFolder, request: dict[str, Any]) -> dict[str, Any]:
                 channel.send("say", f"worker {name} leaves")
             found.end(channel, STOP_AT_ONCE if request["now"] else STOP_DRAINED)
             remove_tree(found.folder)
-        if not host_folder.names("workers") and not request["keep"]:
+        if ours and not host_folder.names("workers") and not request["keep"]:
             host_folder.remove()
     if left:
         raise FailedError("; ".join(left))
@@ -536,16 +590,16 @@ ACTIONS: dict[str, Callable[[HostFolder, dict[str, Any]], dict[str, Any]]] = {
 def handle_request(request: dict[str, Any], channel: Channel) -> None:
     """Do what a request says, and answer."""
     request["files"] = {name: channel.file(size) for name, size in request.get("files", [])}
-    host_folder, where = HostFolder(request["root"], channel), request["root"]
+    where = request["root"]
     try:
+        host_folder = HostFolder(where, channel)
         channel.send("ok", ACTIONS[request["do"]](host_folder, request))
     except FailedError as error:
         channel.send("failed", str(error))
     except OSError as error:
         if request["do"] == "end":
             why = f"{error.filename or where}: {error.strerror or error}"
-            removal = f"cd {shlex.quote(str(host_folder.root))} && rm -rf {' '.join((*FOLDERS, CREATED, LOCK))}"
-            channel.send("failed", f"{why}; what is left there is removed by: {removal}")
+            channel.send("failed", f"{why}; what is left there is removed by: {host_folder.removal}")
         elif error.errno in (errno.ENOSPC, errno.EDQUOT):
             channel.send("failed", f"no space left in {where}: make room there, or name another --remote-dir")
         elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):

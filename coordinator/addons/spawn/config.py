@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from posixpath import normpath
 from typing import Any
 
 from dreamfleet.common.cli.config import load, option, read_table
@@ -47,7 +48,7 @@ class SpawnConfig:
                 raise UsageError(f"--env {each!r}: write it as NAME=VALUE")
         if self.wheelhouse is not None and not any(self.wheelhouse.glob("*.whl")):
             raise UsageError(f"--wheelhouse {self.wheelhouse} holds no wheel: fill it with `pip download -d FOLDER`")
-        if not self.remote_dir.strip("/ ") or self.remote_dir == "~":
+        if normpath(self.remote_dir.strip()) in ("/", "//", "~", ".", "..") or "\0" in self.remote_dir:
             raise UsageError(f"--remote-dir {self.remote_dir!r}: name a folder of its own")
         if not split_flags("--ssh", self.ssh):
             raise UsageError("--ssh: name the ssh client")

@@ -11,7 +11,7 @@ import sys
 import pytest
 
 from dreamfleet.coordinator.addons.spawn import agent
-from dreamfleet.coordinator.addons.spawn.agent import COMPLETE, CREATED, MARK, STATE, Channel, HostFolder
+from dreamfleet.coordinator.addons.spawn.agent import COMPLETE, CREATED, FOLDERS, MARK, STATE, Channel, HostFolder
 from tests.support.processes import ROOT
 
 
@@ -44,21 +44,61 @@ def test_a_folder_removed_while_waiting_for_its_lock_is_created_again(tmp_path, 
         assert (host_folder.root / "lock").exists()
 
 
-def test_a_foreign_folder_is_left_alone(tmp_path, capsys):
-    kept = [tmp_path / "cache" / "a", tmp_path / "workers" / "mine" / "b", tmp_path / "environments" / "c"]
+@pytest.mark.parametrize(
+    "names",
+    [("cache/a", "workers/mine/b", "environments/c"), ("made", "cache/a"), ("lock",), ("workers/mine/worker.json",)],
+)
+def test_a_foreign_folder_is_left_alone(tmp_path, capsys, names):
+    kept = [tmp_path / name for name in names]
     for path in kept:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
-    assert answer(ending({"root": tmp_path}), capsys)["ok"] == {"ended": []}
+    said = answer(ending({"root": tmp_path}), capsys)
+    assert "rm -rf" in said["failed"] if "made" in names else said["ok"] == {"ended": []}
     assert "--remote-dir" in answer({"do": "start", "root": str(tmp_path), "name": "box"}, capsys)["failed"]
     assert all(path.exists() for path in kept)
+
+
+@pytest.mark.parametrize("root", ["~", "~/below/..", "~/..", "~nosuchuser/x"])
+def test_a_home_or_a_folder_above_it_takes_no_worker(tmp_path, capsys, monkeypatch, root):
+    home = tmp_path / "me"
+    (home / "below").mkdir(parents=True)
+    monkeypatch.setenv("HOME", str(home))
+    assert "--remote-dir" in answer({"do": "start", "root": root, "name": "box"}, capsys)["failed"]
+    assert [*tmp_path.rglob("*")] == [home, home / "below"]
+
+
+def test_a_removal_that_was_interrupted_at_its_last_step_is_finished(tmp_path, capsys):
+    host_folder = HostFolder(str(tmp_path / "place"), Channel())
+    with host_folder.locked():
+        pass
+    for name in FOLDERS:
+        (host_folder.root / name).rmdir()
+    (host_folder.root / CREATED).unlink()
+    assert answer(ending({"root": host_folder.root}), capsys)["ok"] == {"ended": []}
+    assert not host_folder.root.exists()
+
+
+def test_an_end_that_waited_for_a_removal_leaves_nothing(tmp_path, monkeypatch, capsys):
+    host_folder, take = HostFolder(str(tmp_path / "place"), Channel()), HostFolder._acquire
+    with host_folder.locked():
+        pass
+
+    def removed(self, lock):
+        monkeypatch.setattr(HostFolder, "_acquire", take)
+        self.remove()
+        take(self, lock)
+
+    monkeypatch.setattr(HostFolder, "_acquire", removed)
+    assert answer(ending({"root": host_folder.root}), capsys)["ok"] == {"ended": []}
+    assert not host_folder.root.exists()
 
 
 def test_a_folder_that_existed_before_stays_with_its_other_files(tmp_path):
     host_folder = HostFolder(str(tmp_path), Channel())
     (tmp_path / "notes").touch()
     with host_folder.locked():
-        (tmp_path / "cache").mkdir()
+        (tmp_path / "cache" / "model").touch()
     with host_folder.locked():
         host_folder.remove()
     assert [path.name for path in tmp_path.iterdir()] == ["notes"]
@@ -101,7 +141,11 @@ def test_damaged_files_of_the_agent_are_read_as_nothing(tmp_path, capsys, damage
     (host_folder.worker("box") / STATE).write_bytes(damage)
     (root / "workers" / ".DS_Store").touch()
     assert agent.inspect_host(host_folder, {})["workers"][0]["running"] is False
-    assert "ok" in answer(ending({"root": root}), capsys)
+    if damage == b'["/"]':  # as the agent writes it
+        assert "ok" in answer(ending({"root": root}), capsys)
+    else:  # it may be somebody's own
+        said = answer(ending({"root": root}), capsys)["failed"]
+        subprocess.run(said[said.index("cd ") :], shell=True, check=True)
     assert not any(root.glob("*"))
 
 

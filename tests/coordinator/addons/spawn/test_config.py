@@ -56,7 +56,7 @@ def test_the_documented_file_is_valid(tmp_path):
         ({"address": "a", "env": ["A"]}, "--env"),
         ({"address": "a", "worker_flags": "--slots 3"}, "--worker-flags"),
         ({"address": "a", "worker_flags": "'"}, "No closing quotation"),
-        ({"address": "a", "remote_dir": "/"}, "--remote-dir"),
+        *(({"address": "a", "remote_dir": folder}, "--remote-dir") for folder in ("", "/", "~/", "./", "~/.", "a\0b")),
         ({"address": "a", "wheelhouse": "/nowhere"}, "--wheelhouse"),
     ],
 )
