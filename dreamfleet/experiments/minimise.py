@@ -182,6 +182,8 @@ class _Searches:
         self._best: tuple[float, Floats] | None = None  # fitness and arguments of the best candidate
         self._favorite: tuple[float, Floats] | None = None  # of the best evaluated mean
         self._history: list[Progress] = []
+        self._before: list[tuple[int, tuple[float, Floats] | None, int]] = []  # calls, best and failed before each
+        self._first = 0  # index of the open search's first generation
         self._runs: list[str] = []
         self._calls = 0  # for candidates
         self._results = 0  # for means too
@@ -267,6 +269,7 @@ class _Searches:
             own["steps"] = candidate_calls(plan.calls, {**own, **settings})
         with start_run_in(self._function.environment, self._workers, self._runs_dir, {**own, **settings}) as run:
             self._runs.append(run.name)
+            self._first = len(self._history)
             for text in () if number else run.warnings:
                 warnings.warn(text, RuntimeWarning, stacklevel=CALLER)
             ended = self._follow_all(run, objective)
@@ -306,7 +309,7 @@ class _Searches:
 
     def _follow_rest(self, run: StartedRun, objective: Objective) -> None:
         """Note what closed since the last report, so that all numbers are of one moment; the callback is not called."""
-        for generation in run.history(sum(each.run == run.name for each in self._history)):
+        for generation in run.new_generations():
             self._follow(run, objective, generation)
 
     def _objective_of(self, plan: _Plan, number: int) -> Objective:
@@ -324,7 +327,12 @@ class _Searches:
         return replace(found, x0=tuple(start))
 
     def _follow(self, run: StartedRun, objective: Objective, generation: StoredGeneration) -> Progress:
-        """Note a closed generation."""
+        """Note a closed generation; one that closes again after a recall replaces itself and those after it."""
+        index = self._first + generation.number
+        if index < len(self._history):
+            self._calls, self._best, self._failed = self._before[index]
+            del self._history[index:], self._before[index:]
+        self._before.append((self._calls, self._best, self._failed))
         self._calls += generation.steps
         self._note_failures(run, generation.failed)
         if self._best is None or generation.best > self._best[0]:

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
-from itertools import count
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Any, Self, Unpack
 from weakref import finalize
@@ -71,7 +71,7 @@ class StartedRun(StoredRun):
         super().__init__(path)
         self.address, self.client = address, client
         self._processes = processes
-        self._next = 1 + max((each.number for each in self.history()), default=-1) if resumed else 0
+        self._seen = self.history() if resumed else []
         self._status_due = time.monotonic() + STATUS_INTERVAL
         self._end: Callable[[], object] = lambda: None
         finalize(self, self._journal.close)
@@ -101,15 +101,14 @@ class StartedRun(StoredRun):
         self.end()
 
     def __iter__(self) -> Iterator[StoredGeneration]:
-        """Each generation once, as soon as it is closed, until the run ends or is ended.
+        """Each generation as soon as it is closed, until the run ends or is ended.
 
+        After a recall (`dreamfleet bar`) numbers go back: what closes again comes again, in place of what came before.
         `DreamfleetError` if a process fails or the run pauses by itself, `StoppedError` if somebody else stops it.
         """
         while True:
             over = self._processes.coordinator.exit_code is not None
-            for generation in self.history(self._next):
-                self._next = generation.number + 1
-                yield generation
+            yield from self.new_generations()
             if over:
                 break
             if self._is_live:  # else the loop's body has ended it
@@ -118,6 +117,22 @@ class StartedRun(StoredRun):
                 time.sleep(POLL_INTERVAL)
         if self._is_live:
             self._processes.check_end()
+
+    def new_generations(self) -> Iterator[StoredGeneration]:
+        """What closed since the last one that came from here; from its first generation on what a recall changed."""
+        last = self._seen[-1:]
+        found = self.history(len(self._seen) - len(last))
+        if repr(found[: len(last)]) == repr(last):  # as texts: NaN equals nothing
+            found = found[len(last) :]
+        else:
+            found = self.history()
+            pairs = zip(found, self._seen, strict=False)
+            same = sum(1 for _ in takewhile(lambda pair: repr(pair[0]) == repr(pair[1]), pairs))
+            del self._seen[same:]
+            found = found[same:]
+        for generation in found:
+            self._seen.append(generation)
+            yield generation
 
     def wait(self) -> Self:
         """Wait until the run has ended; errors as in iterating."""

@@ -11,7 +11,8 @@ from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.experiments import minimise as module
 from dreamfleet.experiments.search_arguments import read_bounds, read_objective
-from tests.support import objectives
+from tests.support import lying_tasks, objectives
+from tests.support.lying_tasks import LIES
 from tests.support.processes import free_port, until
 
 FEW = {"workers": 1, "popsize": 8}
@@ -84,6 +85,31 @@ def test_a_search_that_somebody_stops_raises(tmp_path):
 
     with pytest.raises(StoppedError):
         dreamfleet.minimise(objectives.flat, [0, 0], 1.0, callback=stop, listen=address, runs_dir=tmp_path, **FEW)
+
+
+@pytest.mark.slow
+def test_what_a_barred_host_brought_is_in_no_result(processes, tmp_path):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    task = ("--task", "function:tests.support.lying_tasks:sphere")
+    liar = processes.worker("--run", "mine", "--name", "liar", *task, endpoint=endpoint, inside=("env", f"{LIES}=1"))
+    seen = []
+
+    def bar_a_liar(progress):
+        seen.append(progress)
+        if progress.fun < 0 and min((each.fun for each in seen[:-1]), default=0) >= 0:
+            with Client(endpoint) as client:
+                client.control("mine", "bar", "liar")
+
+    found = dreamfleet.minimise(
+        lying_tasks.sphere, [3, 4], 1.0, generations=20, run="mine", runs_dir=tmp_path, listen=endpoint,
+        callback=bar_a_liar, **FEW,
+    )  # fmt: skip
+    liar.end()
+    assert min(each.fun for each in seen) < 0
+    assert found.fun == pytest.approx(lying_tasks.sphere(found.x))
+    with dreamfleet.open_run("mine", tmp_path) as run:
+        assert [each.mean for each in found.history] == [-each.mean for each in run.history()]
+        assert found.history[-1].fun == -max(each.best for each in run.history())
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """A task on hosts that lie: the environment of their worker says which."""
 
 import os
+import time
 
 import gymnasium
 import numpy as np
@@ -19,6 +20,12 @@ class Watched(Toy):
 
     def make_environment(self, assignment):
         return LyingEnvironment(self.seconds) if LIES in os.environ else ToyEnvironment(self.seconds)
+
+
+def sphere(x):
+    """Slow enough for hosts to share a search; a host that lies has a value below the least one."""
+    time.sleep(0.02)
+    return float(np.square(x - 1).sum()) - 50 * (LIES in os.environ)
 
 
 class LyingEnvironment(gymnasium.Wrapper):
