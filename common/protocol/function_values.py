@@ -46,7 +46,8 @@ def spans_decades(values: Sequence[float]) -> bool:
     >>> spans_decades([0.001, 1.0]), spans_decades([0.5, 1.0]), spans_decades([0.0, 0.001, 1.0])
     (True, False, True)
     """
-    return min(values) >= 0 and max(values) > TWO_DECADES * least_positive(values)
+    known = [each for each in values if not math.isnan(each)]
+    return bool(known) and min(known) >= 0 and max(known) > TWO_DECADES * least_positive(known)
 
 
 def least_positive(values: Iterable[float]) -> float:

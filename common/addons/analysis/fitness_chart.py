@@ -53,7 +53,7 @@ def draw_fitness(panels: Sequence[Any], run: RunFolder) -> list[Any]:
     legend.
     """
     task, evaluations, stages = run.spec, run.evaluations(), _stages(run)
-    history = [in_values(each, task) for each in run.history()]
+    history = [in_values(each, task) for each in run.scored_history()]
     number, mean, std, best, worst = np.array(
         [(each.number, each.mean, each.std, each.best, each.worst) for each in history]
     ).T
@@ -119,7 +119,9 @@ def running_median(values: NDArray[np.float64], begins: Sequence[int] = (0,)) ->
     half, smooth = WINDOW // 2, np.empty_like(values)
     for first, last in pairwise((*begins, len(values))):
         for place in range(first, last):
-            smooth[place] = np.median(values[max(first, place - half) : min(last, place + half + 1)])
+            near = values[max(first, place - half) : min(last, place + half + 1)]
+            known = near[~np.isnan(near)]
+            smooth[place] = np.median(known) if len(known) else np.nan
     return smooth
 
 

@@ -48,7 +48,7 @@ def list_runs(runs_dir: Path) -> list[dict[str, Any]]:
 def describe_run(runs_dir: Path, name: str) -> dict[str, Any]:
     """All details of one run; `JournalError` or `UsageError` if there is none or it is unreadable."""
     with open_run(runs_dir, name) as run, run.read_transaction():
-        settings, history = run.settings, run.history()
+        settings, history = run.settings, run.scored_history()
         if [each.number for each in history] != list(range(len(history))):
             raise JournalError(f"the journal of run {name} is damaged: generations are missing; restore it from a copy")
         data = RunData(settings, history, run.evaluations(), run.confirmation(), run.episode_limit)
@@ -183,7 +183,8 @@ def _outcome(run: RunFolder, view: RunView, total: Effort) -> Facts:
 
 
 def _generation_row(each: StoredGeneration) -> dict[str, Any]:
+    fitness = {name: getattr(each, name) for name in ("mean", "std", "best", "worst")}
     return {
-        "generation": each.number, "mean": each.mean, "std": each.std, "best": each.best, "worst": each.worst,
+        "generation": each.number, **{name: None if isnan(value) else value for name, value in fitness.items()},
         "sigma": each.sigma, "failed": each.failed or None, "steps": each.steps, "seconds": each.seconds,
     }  # fmt: skip

@@ -78,7 +78,7 @@ def _draw_learning(args: argparse.Namespace, out: Path) -> None:
 
     curves = []
     for name in dict.fromkeys(args.run_names):
-        with open_run(args.runs_dir, name) as stored:
+        with open_run(args.runs_dir, name) as stored, stored.read_transaction():
             curves.append(LearningCurve.of(stored))
     worlds = sorted({each.world for each in curves})
     if len(worlds) > 1:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -27,7 +28,7 @@ from dreamfleet.common.runs.run_folder import RunFolder
 
 Row = dict[str, Any]
 TABLES: dict[str, tuple[type[Any], Callable[[RunFolder], Sequence[Any]]]] = {
-    "generations": (StoredGeneration, RunFolder.history),
+    "generations": (StoredGeneration, RunFolder.scored_history),
     "candidates": (StoredCandidate, RunFolder.candidates),
     "evaluations": (StoredEvaluation, RunFolder.evaluations),
     "confirmation": (StoredConfirmation, lambda run: [each] if (each := run.confirmation()) else []),
@@ -87,12 +88,13 @@ def scalars_of(run: RunFolder, since: int = 0) -> Iterator[tuple[int, dict[str, 
 
     `__` in a name stands for the `/` that groups curves.
     """
-    for each in run.history(since):
-        yield each.number, {
+    for each in run.scored_history(since):
+        numbers = {
             "fitness__mean": each.mean, "fitness__std": each.std, "fitness__best": each.best,
             "fitness__worst": each.worst, "search__sigma": each.sigma, "effort__steps": each.steps,
             "effort__seconds": each.seconds,
         }  # fmt: skip
+        yield each.number, {name: value for name, value in numbers.items() if not math.isnan(value)}
     for judged in run.evaluations():
         yield judged.generation, _score("evaluated", judged)
     if (confirmed := run.confirmation()) is not None:
@@ -112,9 +114,10 @@ def columns_of(table: str) -> list[str]:
 
 
 def rows_of(run: RunFolder, table: str) -> list[Row]:
-    """A run's rows of a table."""
+    """A run's rows of a table; `None` stands for a fitness that there is none."""
     _, read = TABLES[table]
-    return [with_error(each) if table in JUDGED else asdict(each) for each in read(run)]
+    rows = [with_error(each) if table in JUDGED else asdict(each) for each in read(run)]
+    return [{name: None if value != value else value for name, value in row.items()} for row in rows]  # noqa: PLR0124
 
 
 def _tables(run: RunFolder) -> Iterator[tuple[str, list[str], list[Row]]]:
@@ -129,20 +132,26 @@ def _tables(run: RunFolder) -> Iterator[tuple[str, list[str], list[Row]]]:
 def _export_tables(
     run: RunFolder, folder: Path, kind: str, save: Callable[[Path, Sequence[str], Sequence[Row]], None]
 ) -> list[Path]:
-    """Write a file for each table with rows; remove files of an earlier export whose tables are empty now."""
+    """Write a file for each table with rows.
+
+    `UsageError` if the folder has a file of the name of a table that has none: it would look like this run's.
+    """
     with reporting_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    written = []
-    for name, columns, rows in _tables(run):
+    tables, written = list(_tables(run)), list[Path]()
+    missing = {*TABLES, ELITES} - {name for name, _, _ in tables}
+    others = [f"{name}.{kind}" for name in missing] + [f"{ELITES}.npz"] * (ELITES in missing)
+    if strange := sorted(name for name in others if is_file(folder / name)):
+        raise UsageError(
+            f"{folder} holds {', '.join(strange)}, and run {run.name} has no such table: remove it, or choose another "
+            "--out"
+        )
+    for name, columns, rows in tables:
         written.append(folder / f"{name}.{kind}")
         save(written[-1], columns, rows)
         if name == ELITES:
             written.append(folder / f"{ELITES}.npz")
             _save_elites(run, rows, written[-1])
-    with reporting_write_errors(folder):
-        for path in (*(folder / f"{name}.{kind}" for name in (*TABLES, ELITES)), folder / f"{ELITES}.npz"):
-            if path not in written and is_file(path):
-                path.unlink()
     return written
 
 

@@ -10,9 +10,11 @@ import pytest
 from pyarrow import parquet
 
 from dreamfleet.common.cli import command_line
+from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.processes import command
 from dreamfleet.common.runs.records import StoredConfirmation
 from dreamfleet.common.runs.run_folder import CONFIRMED, RunFolder
+from dreamfleet.coordinator.addons.runs.export import export_csv, export_parquet, export_tensorboard
 from dreamfleet.experiments.verbs.compare import SAME_SEEDS
 from tests.support.disks import small_disk
 from tests.support.events import scalars
@@ -51,6 +53,27 @@ def test_csv_tables_hold_every_row_of_the_journal(export, stored):
         (each.generation, each.number) for each in candidates
     ]
     assert [float(row["error"]) for row in read["evaluations.csv"]] == [each.error for each in evaluations]
+
+
+def test_a_generation_without_a_fitness_has_none_in_any_export(runs, tmp_path, monkeypatch):
+    monkeypatch.setattr(RunFolder, "unscored_generations", lambda _: {1})
+    with RunFolder(runs / "reality") as run:
+        for write in (export_csv, export_parquet, export_tensorboard):
+            write(run, tmp_path)
+    fitness, drawn = ("mean", "std", "best", "worst"), scalars(tmp_path)
+    assert [read_csv(tmp_path / "generations.csv")[1][name] for name in fitness] == [""] * 4
+    assert [parquet.read_table(tmp_path / "generations.parquet").to_pylist()[1][name] for name in fitness] == [None] * 4
+    assert 1 not in dict(drawn["fitness/best"])
+    assert 1 in dict(drawn["search/sigma"])
+
+
+@pytest.mark.parametrize("name", ["elites.csv", "elites.npz"])
+def test_files_of_others_are_neither_removed_nor_taken_for_its_own(runs, tmp_path, name):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).write_text("mine")
+    with RunFolder(runs / "reality") as run, pytest.raises(UsageError, match=name):
+        export_csv(run, tmp_path / "out")
+    assert [each.name for each in (tmp_path / "out").iterdir()] == [name]
 
 
 def test_candidates_have_their_episodes_and_effort(runs, stored):
@@ -108,18 +131,16 @@ def test_an_evaluation_of_one_episode_has_no_error_in_any_export_or_view(runs, e
         printed("runs", "plot", *names, "--out", tmp_path / "a.svg")
 
 
-def test_no_table_of_an_earlier_export_stands_among_those_of_a_later_one(runs, export):
+@pytest.mark.parametrize("write", [export_csv, export_parquet])
+def test_no_table_of_an_earlier_export_stands_among_those_of_a_later_one(runs, tmp_path, write):
+    """A recall can take a run's confirmation."""
     confirmed = StoredConfirmation(1, 4, 1.0, 1.0, 999)
     change_journal(runs / "reality", "INSERT INTO run VALUES (?, ?)", CONFIRMED, confirmed.to_json())
-    for kind in ("csv", "parquet"):
-        out = export(kind)
-        assert (out / f"confirmation.{kind}").exists()
-        (out / "notes.txt").write_text("of somebody's own")
+    with RunFolder(runs / "reality") as run:
+        write(run, tmp_path)
     change_journal(runs / "reality", "DELETE FROM run WHERE key = ?", CONFIRMED)
-    for kind in ("csv", "parquet"):
-        out = export(kind)
-        assert not (out / f"confirmation.{kind}").exists()
-        assert (out / "notes.txt").exists()
+    with RunFolder(runs / "reality") as run, pytest.raises(UsageError, match="confirmation"):
+        write(run, tmp_path)
 
 
 @pytest.mark.slow

@@ -55,6 +55,20 @@ def test_what_was_spent_on_its_start_counts_for_a_run(runs):
     assert after.total == before.total + Effort(1000, 0, 7)
 
 
+def test_a_run_that_goes_on_meanwhile_is_drawn_as_of_one_moment(runs, tmp_path, monkeypatch):
+    """The verb reads points, spending and evaluations one after another."""
+    total = RunFolder.total_effort
+
+    def judge_another(run):
+        copied = "vector, episodes, mean, std, failed, checksum FROM evaluation LIMIT 1"
+        change_journal(runs / "reality", f"INSERT INTO evaluation SELECT 999, {copied}")
+        return total(run)
+
+    change_journal(runs / "reality", "PRAGMA journal_mode = WAL")
+    monkeypatch.setattr(RunFolder, "total_effort", judge_another)
+    printed("runs", "plot", "reality", "--kind", "learning", "--out", tmp_path / "a.png")
+
+
 @pytest.mark.parametrize(
     ("words", "made"),
     [("hidden", "hidden-fitness.png"), ("reality", "reality-fitness.png"),
