@@ -24,7 +24,7 @@ from dreamfleet.common.runs.standard_error import sample_std
 from dreamfleet.coordinator.jobs.work import Work, make_work
 
 FINALISTS = 4
-FindScores = Callable[[list[bytes]], Mapping[bytes, float]]
+FindScores = Callable[[list[Work]], Mapping[bytes, float]]
 """Finds the known scores of jobs, by digest; NaN for an episode that failed for good."""
 
 
@@ -139,7 +139,7 @@ class Confirmation:
         ]
         self._work = work
         self._digests = [each.digest for each in work]
-        self._scores = dict(known(self._digests))
+        self._scores = dict(known(work))
         return [each for each in work if each.digest not in self._scores]
 
     def _close(self) -> None:

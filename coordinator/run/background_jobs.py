@@ -173,14 +173,14 @@ class BackgroundJobs:
         """An evaluated mean's scores by seed, from the journal (R28), whichever evaluation of that mean had them."""
         vector, settings = self._journal.evaluated_vector(generation), self._settings
         work = Evaluation(generation, vector, settings.evaluation_episodes).work(settings.task)
-        known = self._journal.fitness_of("evaluate", [each.digest for each in work])
+        known = self._journal.fitness_of("evaluate", work)
         scores = {each.job.seeds[0]: known.get(each.digest, nan) for each in work}
         return {seed: score for seed, score in scores.items() if not isnan(score)}
 
     def _evaluate(self, evaluation: Evaluation) -> list[Work]:
-        wanted = [each.digest for each in evaluation.work(self._settings.task)]
+        wanted = evaluation.work(self._settings.task)
         work = self.evaluations.open(evaluation, self._settings.task, self._journal.fitness_of("evaluate", wanted))
-        self._verification.restore(evaluation.work(self._settings.task))
+        self._verification.restore(wanted)
         self._finish(evaluation.generation)
         return work
 

@@ -103,6 +103,6 @@ class ExternalGenerations(Generations):
 
         Their steps belong to the generation that made them.
         """
-        known = self._journal.fitness_of("score", [work.digest for work in generation.missing])
+        known = self._journal.fitness_of("score", generation.missing)
         generation.recall({digest: (fitness, 0, ()) for digest, fitness in known.items()})
         return generation

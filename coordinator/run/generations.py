@@ -125,7 +125,7 @@ class Generations:
         may_have_results = self._journal.recalls.has_set_aside
         generation = self._generation(number, vectors, seeds, begun, in_parts=not may_have_results)
         if may_have_results:
-            self._journal.recalls.count_again([each.digest for each in generation.work])
+            self._journal.recalls.count_again(generation.work)
             generation.recall(self._journal.results.of("score", number))
         return generation
 

@@ -32,6 +32,7 @@ from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL
 from dreamfleet.coordinator.jobs.confirmation import Finalist
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollection
+from dreamfleet.coordinator.jobs.work import Work
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
 from dreamfleet.coordinator.storage.batch_records import BatchRecords
 from dreamfleet.coordinator.storage.checksum_records import ChecksumRecords
@@ -325,10 +326,10 @@ class Journal(JournalConnection):
         with RunFolder(self.path.parent) as folder:
             return folder.history(), folder.evaluations()
 
-    def fitness_of(self, kind: Kind, digests: Sequence[bytes]) -> dict[bytes, float]:
+    def fitness_of(self, kind: Kind, work: Sequence[Work]) -> dict[bytes, float]:
         """As `ResultRecords.fitness_of`; results of dropped generations that these jobs want count again."""
-        self.recalls.count_again(digests)
-        return self.results.fitness_of(kind, digests)
+        self.recalls.count_again(work)
+        return self.results.fitness_of(kind, [each.digest for each in work])
 
     def pending_evaluations(self) -> list[Evaluation]:
         """Evaluations that were scheduled and not finished, oldest first."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from itertools import groupby
 from time import time
 
 from dreamfleet.common.runs.journal.journal_reader import digest_terms
 from dreamfleet.common.runs.run_folder import CONFIRMED, ENDED_AT, ENDING, STOP_KIND
+from dreamfleet.coordinator.jobs.work import Work
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
 from dreamfleet.coordinator.storage.checksum_records import ChecksumRecords
 from dreamfleet.coordinator.storage.journal_connection import JournalConnection
@@ -73,7 +75,7 @@ class RecallRecords:
         did not want are here again: its barrier may be another.
         """
         write = self._journal.write
-        self._count_again("because = ? AND generation = ?", SURPLUS, number)
+        self._count_again(number, "because = ? AND generation = ?", SURPLUS, number)
         write("UPDATE recalled SET because = ? WHERE because = ? AND generation > ?", REWOUND, SURPLUS, number)
         self._set_aside(REWOUND, "generation > ? OR (generation = ? AND kind != 'score')", number, number)
         write("DELETE FROM failure WHERE generation > ? OR (generation = ? AND kind != 'score')", number, number)
@@ -107,12 +109,16 @@ class RecallRecords:
             self._has_set_aside = row is not None
         return self._has_set_aside
 
-    def count_again(self, digests: Sequence[bytes]) -> None:
-        """Count results of dropped generations again that these jobs want."""
+    def count_again(self, work: Iterable[Work]) -> None:
+        """Count results of dropped generations again that these jobs want, as results of the jobs' own generations.
+
+        Of a mean that stays, another generation may want what a dropped one did.
+        """
         if not self.has_set_aside:
             return
-        for these, some in digest_terms(digests):
-            self._count_again(f"because = ? AND {these}", REWOUND, *some)
+        for generation, jobs in groupby(work, key=lambda each: each.template.generation):
+            for these, some in digest_terms([each.digest for each in jobs]):
+                self._count_again(generation, f"because = ? AND {these}", REWOUND, *some)
 
     def set_surplus_aside(self, generation: int, digests: Sequence[bytes]) -> None:
         """Count these results and failures of a race no more, which is about to close and does not want them.
@@ -157,21 +163,26 @@ class RecallRecords:
         )  # fmt: skip
         self._journal.write(f"DELETE FROM result WHERE {where}", *values)  # noqa: S608
 
-    def _count_again(self, where: str, *values: object) -> None:
-        """Move results back from the table of those that do not count, and let their checks stand again.
+    def _count_again(self, generation: int, where: str, *values: object) -> None:
+        """Move results back from those that do not count, to this generation, and let their checks stand again.
 
         A check stands by the word of a host that is still believed.
         """
         write = self._journal.write
         taken = self._journal.read(f"SELECT DISTINCT digest FROM recalled WHERE {where}", *values)  # noqa: S608
-        changed = f"generation IN (SELECT generation FROM recalled WHERE {where})"  # noqa: S608
-        write(f"UPDATE evaluation SET checksum = NULL WHERE {changed}", *values)  # noqa: S608
+        if not taken:
+            return
+        write("UPDATE evaluation SET checksum = NULL WHERE generation = ?", generation)
         self._checksums.is_unsealed = True
-        back = f"INSERT OR IGNORE INTO result ({COLUMNS}) SELECT {COLUMNS} FROM recalled WHERE {where}"  # noqa: S608
-        write(back, *values)
+        columns = COLUMNS.replace("generation", "?")
+        back = f"INSERT OR IGNORE INTO result ({COLUMNS}) SELECT {columns} FROM recalled WHERE {where}"  # noqa: S608
+        write(back, generation, *values)
         write(f"DELETE FROM recalled WHERE {where}", *values)  # noqa: S608
-        stands = "UPDATE verification SET stands = 1 WHERE digest = ? AND outcome = 'equal' AND checker != ''"
-        self._journal.write_all(stands, taken)
+        self._journal.write_all(
+            "UPDATE verification SET stands = 1, generation = ? WHERE digest = ? AND outcome = 'equal' "
+            "AND checker != ''",
+            [(generation, *each) for each in taken],
+        )
         self._results.forget_totals()
 
     def _void_checks(self, hosts: Collection[str]) -> None:

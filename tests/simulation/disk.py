@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.host_classes import HostClasses
@@ -25,6 +26,7 @@ from dreamfleet.coordinator.jobs.confirmation import Finalist
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.generation import KnownResult
 from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollection
+from dreamfleet.coordinator.jobs.work import Work
 from dreamfleet.coordinator.storage.journal import StoredOpenGeneration
 from dreamfleet.coordinator.storage.verification_records import StoredAnswer, StoredBar
 from tests.simulation.violation import Violation
@@ -241,13 +243,14 @@ class MemoryRecalls:
     def has_set_aside(self) -> bool:
         return any(because == "rewound" for because, _ in self.tables.rows["recalled"].values())
 
-    def count_again(self, digests: Sequence[bytes]) -> None:
+    def count_again(self, work: Iterable[Work]) -> None:
+        wanted = {each.digest: each.template.generation for each in work}
         found = {digest: (key, row) for key, (because, row) in self.tables.rows["recalled"].items()
-                 for digest in [key[0]] if because == "rewound" and digest in digests}  # fmt: skip
-        for digest, (key, row) in found.items():
+                 for digest in [key[0]] if because == "rewound" and digest in wanted}  # fmt: skip
+        for digest, (key, (job, *brought)) in found.items():
             self.tables.put("recalled", key, None)
             if digest not in self.tables.rows["result"]:
-                self.tables.put("result", digest, row)
+                self.tables.put("result", digest, (replace(job, generation=wanted[digest]), *brought))
 
     def rollouts(self) -> list[tuple[int, int]]:
         """Nothing reads them, and the simulated folder is not there."""
@@ -381,9 +384,9 @@ class MemoryJournal:
         generations = [row["closed"] for _, row in sorted(self.tables.rows["generation"].items()) if "closed" in row]
         return generations, [done for _, (_, done) in sorted(self.tables.rows["evaluation"].items()) if done]
 
-    def fitness_of(self, kind: Kind, digests: Sequence[bytes]) -> dict[bytes, float]:
-        self.recalls.count_again(digests)
-        return self.results.fitness_of(kind, digests)
+    def fitness_of(self, kind: Kind, work: Sequence[Work]) -> dict[bytes, float]:
+        self.recalls.count_again(work)
+        return self.results.fitness_of(kind, [each.digest for each in work])
 
     def pending_evaluations(self) -> list[Evaluation]:
         return [evaluation for _, (evaluation, done) in sorted(self.tables.rows["evaluation"].items()) if done is None]

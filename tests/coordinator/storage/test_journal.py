@@ -105,18 +105,17 @@ def test_results_of_a_run_of_batches_wait_for_their_check_in_any_generation(jour
     assert journal.verification.unverified([each.job for each in late]).keys() == {each.job.digest for each in early}
     journal.verification.add(early[0].job, "w/00000000", "v", "equal")
     assert journal.verification.unverified([each.job for each in late]).keys() == {early[1].job.digest}
-    assert journal.fitness_of("score", [each.job.digest for each in late]) == {
-        each.job.digest: float(value) for value, each in enumerate(early)
-    }
+    assert journal.fitness_of("score", late) == {each.job.digest: float(value) for value, each in enumerate(early)}
 
 
 def test_a_check_stands_again_with_its_result_though_another_generation_asked_for_it(journal):
-    first, again = (Evaluation(number, VECTORS[0], 1).work(SPEC)[0].job for number in (3, 5))
+    (first,), work = (Evaluation(number, VECTORS[0], 1).work(SPEC) for number in (3, 5))
+    first, again = first.job, work[0].job
     journal.results.add(first, Result(first.digest, 5.0, 10, 0.5, None, None), "w/00000000", "f", 1, "class")
     journal.verification.add(again, "w/00000000", "v", "equal")
     journal.recalls._set_aside(REWOUND, "generation = 3")
     journal.recalls._settle_recall()
-    assert journal.fitness_of("evaluate", [again.digest]) == {again.digest: 5.0}
+    assert journal.fitness_of("evaluate", work) == {again.digest: 5.0}
     assert journal.verification.unverified([again]) == {}
 
 

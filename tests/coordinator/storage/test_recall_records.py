@@ -4,6 +4,7 @@ import pytest
 
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.records import StoredEvaluation
+from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.storage.journal import Journal
@@ -45,22 +46,42 @@ def test_a_check_does_not_stand_again_by_the_word_of_a_host_that_was_barred(jour
     journal.recalls.rewind(0, b"state", SEEDS)
     journal.recalls.recall({"b"})
     journal.open_generation(1, b"state", 0.1, SEEDS, VECTORS)
-    journal.recalls.count_again([*digests_of(1)])
+    journal.recalls.count_again(jobs_of(1))
     assert set(journal.results.of("score", 1)) == digests_of(1), "what a brought counts again"
     assert unverified(journal, 0) == digests_of(0)
     assert unverified(journal, 1) == digests_of(1)
     journal.verification.unbar("b")
     journal.recalls.rewind(0, b"state", SEEDS)
-    journal.recalls.count_again([*digests_of(1)])
+    journal.recalls.count_again(jobs_of(1))
     assert unverified(journal, 1) == digests_of(1), "nor once it may come again"
 
 
 def test_a_check_stands_again_by_the_word_of_a_host_that_was_not_barred(journal):
     journal.recalls.rewind(0, b"state", SEEDS)
     journal.open_generation(1, b"state", 0.1, SEEDS, VECTORS)
-    journal.recalls.count_again([*digests_of(1)])
+    journal.recalls.count_again(jobs_of(1))
     assert not unverified(journal, 0)
     assert not unverified(journal, 1)
+
+
+def test_what_a_dropped_evaluation_had_counts_for_an_earlier_one_of_the_same_mean(journal):
+    last, first = (Evaluation(number, VECTORS[0], 3) for number in (1, 0))
+    seeds = {}
+    for job in (each.job for each in last.work(SPEC)):
+        seeds[job.seeds[0]] = float(job.episode)
+        journal.results.add(job, Result(job.digest, float(job.episode), 10, 0.1, None, None), "a/1", "f", 1, "class")
+        journal.verification.add(job, "a/1", "b", "equal")
+    journal.schedule_evaluation(last)
+    journal.recalls.rewind(0, b"state", SEEDS)
+    journal.schedule_evaluation(first)
+    assert len(journal.fitness_of("evaluate", first.work(SPEC))) == 3
+    journal.finish_evaluation(0, StoredEvaluation(0, 3, 1.0, 0.8), 0)
+    journal.commit()
+    with RunFolder(journal.path.parent) as run:
+        run.verify()
+        assert run.scores(0) == seeds
+    journal.recalls.recall({"b"})
+    assert journal.pending_evaluations() == [first], "its checks are of its generation, too"
 
 
 def test_a_recall_begins_where_a_host_alone_confirmed_what_others_brought(journal):
@@ -95,11 +116,12 @@ def test_a_check_of_several_hosts_stands_while_one_of_them_is_believed(journal, 
 
 
 def test_what_a_closed_race_did_not_want_is_aside_and_counts_again_if_its_generation_opens_again(journal):
-    steps, (surplus, *others) = journal.results.effort.steps, [work.digest for work in jobs_of(1)]
+    steps, work = journal.results.effort.steps, jobs_of(1)
+    surplus, *others = [each.digest for each in work]
     journal.recalls.set_surplus_aside(1, [surplus])
     assert set(journal.results.of("score", 1)) == set(others)
     assert journal.results.effort.steps == steps - 10
-    journal.recalls.count_again([surplus])
+    journal.recalls.count_again(work[:1])
     assert surplus not in journal.results.of("score", 1), "its generation is closed"
     journal.recalls.rewind(1, b"state", SEEDS)
     assert set(journal.results.of("score", 1)) == {surplus, *others}
@@ -111,7 +133,7 @@ def test_what_a_race_of_a_dropped_generation_did_not_want_counts_again_when_its_
     surplus, *others = [work.digest for work in jobs_of(1)]
     journal.recalls.set_surplus_aside(1, [surplus])
     journal.recalls.rewind(0, b"state", SEEDS)
-    journal.recalls.count_again([surplus, *others])
+    journal.recalls.count_again(jobs_of(1))
     assert set(journal.results.of("score", 1)) == {surplus, *others}
 
 
