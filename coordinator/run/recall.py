@@ -12,6 +12,7 @@ from pathlib import Path
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import plural, printable
 from dreamfleet.common.runs.records import RunSettings
+from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL
 from dreamfleet.common.runs.stages import StageTracker
@@ -81,16 +82,15 @@ def bar_stored(folder: Path, host: str, *, is_barred: bool) -> str:
     """Bar a host from the run in `folder`, which nobody serves, or let it in again; what was done, in words.
 
     R33: what it brought is taken back, so an ended run is open again. `UsageError` if the run is served, or if there is
-    nothing to do.
+    nothing to do; `DamagedJournalError` if the journal is not what was written. Then nothing is changed.
     """
-    with run_lock(folder), closing(Journal(folder / JOURNAL)) as journal:
+    with run_lock(folder), closing(_verified(folder)) as journal:
         known = {*map(host_of, journal.results.workers(recalled=True))}
         if problem := find_bar_problem(host, journal.verification.barred(), known, is_barred=is_barred):
             raise UsageError(problem)
         incarnation = journal.begin_incarnation()
         if is_barred:
             journal.verification.bar(host, BAR_BY_OPERATOR, incarnation)
-            withdraw_controller(folder / CONTROLLER)
             words = recall(journal, RunSettings.from_json(journal.fact("settings") or ""), {host})
             text = f"host {printable(host)} is barred from this run: {BAR_BY_OPERATOR.why}; {words}"
         else:
@@ -98,9 +98,18 @@ def bar_stored(folder: Path, host: str, *, is_barred: bool) -> str:
             text = unbar_words(host)
         journal.add_event(text, "barred" if is_barred else "unbarred", host)
         journal.end_incarnation()
+        if is_barred:
+            withdraw_controller(folder / CONTROLLER)  # now that nothing but the disk can refuse the recall
         journal.commit()
         RolloutCollections(folder).remove(journal.recalls.rollouts())  # not before the recall was durable
     return text
+
+
+def _verified(folder: Path) -> Journal:
+    """The journal of a run that this process locked, compared with its checksums: a recall replays what it holds."""
+    with RunFolder(folder) as stored:
+        stored.verify()
+    return Journal(folder / JOURNAL)
 
 
 def unbar_words(host: str) -> str:

@@ -64,6 +64,7 @@ class Run:
         limit = journal.fact(EPISODE_LIMIT)
         self.episode_limit = None if limit is None else int(limit)  # steps; of the environment itself, if it is known
         self.incarnation = journal.begin_incarnation()
+        journal.commit()
         self._notes: list[Note] = []  # that are in the journal and not in the log
         self.admission = WorkerAdmission(journal, settings, self.fleet, strict=network.strict, anchor_key=anchor_key)
         self.verification = Verification(journal, self.fleet, self.admission, network.verify, self.incarnation)
@@ -277,9 +278,9 @@ class Run:
         before = [*self.fleet.notes]
         try:
             hosts = bar()
-            self.background_jobs.report.withdraw()
             self.fleet.note(recall(self.journal, self.settings, hosts), "recalled")
             self._write_notes()
+            self.background_jobs.report.withdraw()
             self.journal.commit()
         except NotWritableNowError as error:
             self.journal.forget_writes()

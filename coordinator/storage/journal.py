@@ -145,7 +145,7 @@ class Journal(JournalConnection):
         self.set_fact("ended", why)
 
     def begin_incarnation(self) -> int:
-        """Number of this life of the coordinator, from 1; durable before anything is published."""
+        """Number of this life of the coordinator, from 1; to be committed before anything is published."""
         number = int(self.fact("incarnation") or 0) + 1
         last = self.read_row("SELECT what FROM event ORDER BY number DESC LIMIT 1")
         killed = "; the last one was killed, crashed or could not write" if last not in (None, (LEAVES,)) else ""
@@ -153,9 +153,8 @@ class Journal(JournalConnection):
         self.set_fact("incarnation", str(number))
         self.drop_fact(REST)
         self.add_event(f"incarnation {number} begins{killed}")
-        self.commit()
-        self.set_patience(SERVING_PATIENCE)
         self.opened = self._committed = self.read_row("SELECT max(number) FROM generation")[0]
+        self.set_patience(SERVING_PATIENCE)
         return number
 
     def end_incarnation(self) -> None:

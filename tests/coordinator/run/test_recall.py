@@ -1,16 +1,18 @@
 """A run that is taken back to an earlier generation, in a real journal and with real optimisers."""
 
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.errors import JournalError, NotWritableNowError, UsageError
+from dreamfleet.common.errors import DamagedJournalError, JournalError, NotWritableNowError, UsageError
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.common.runs.run_paths import CONTROLLER
+from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL
 from dreamfleet.common.runs.stages import StageTracker, stages_of
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.optimisers.evolution import Evolution
@@ -319,12 +321,9 @@ def test_a_life_without_a_closed_generation_has_no_reported_controller(begin):
 def test_a_bar_that_is_killed_leaves_a_run_without_a_controller_or_all_of_the_recall(ended, monkeypatch):
     bench = ended()
     bench.journal.close()
-    commits, commit = [], Journal.commit
 
     def killed(self):
-        if commits:
-            raise KeyboardInterrupt
-        commits.append(commit(self))
+        raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
         patched.setattr(Journal, "commit", killed)
@@ -336,6 +335,24 @@ def test_a_bar_that_is_killed_leaves_a_run_without_a_controller_or_all_of_the_re
         assert run.checks is None
     bar_stored(bench.path, "a", is_barred=True)
     assert not (bench.path / CONTROLLER).exists()
+
+
+@pytest.mark.parametrize("refusal", ["damage", "no optimiser"])
+def test_a_bar_that_is_refused_changes_nothing(ended, monkeypatch, refusal):
+    bench = ended()
+    bench.run.leave()
+    if refusal == "damage":
+        bench.journal.write("UPDATE result SET fitness = 123 WHERE kind = 'score' AND generation = 0 AND candidate = 0")
+        bench.journal.commit()
+    else:
+        monkeypatch.setattr(Evolution, "of", Mock(side_effect=UsageError("cannot be imported")))
+    with closing(bench.journal):
+        before = [*bench.journal._connection.iterdump()]
+    with pytest.raises((DamagedJournalError, UsageError)):
+        bar_stored(bench.path, "b", is_barred=True)
+    with closing(Journal(bench.path / JOURNAL)) as journal:
+        assert [*journal._connection.iterdump()] == before
+    assert (bench.path / CONTROLLER).exists()
 
 
 def test_a_bar_on_a_full_disk_is_refused_and_changes_nothing(begin, monkeypatch):

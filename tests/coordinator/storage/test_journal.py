@@ -230,6 +230,7 @@ def test_a_run_is_live_while_its_folder_is_held(journal, folder):
 def test_a_journal_that_is_overwritten_in_place_is_noticed_and_readers_are_not(journal, folder):
     fill(journal)
     journal.begin_incarnation()
+    journal.commit()
     journal._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     with RunFolder(folder) as run:
         assert run.history()
@@ -244,9 +245,11 @@ def test_a_journal_that_is_overwritten_in_place_is_noticed_and_readers_are_not(j
 
 def test_a_second_life_in_one_journal_is_noticed_by_the_first(journal, folder):
     journal.begin_incarnation()
+    journal.commit()
     journal.check_incarnation()
     other = Journal(folder / "journal.sqlite")
     other.begin_incarnation()
+    other.commit()
     other.close()
     with pytest.raises(JournalError, match=f"{folder.name}.* 2.* 1"):
         journal.check_incarnation()
