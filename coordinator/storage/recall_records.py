@@ -9,6 +9,7 @@ from time import time
 
 from dreamfleet.common.runs.journal.journal_reader import digest_terms
 from dreamfleet.common.runs.run_folder import CONFIRMED, ENDED_AT, ENDING, STOP_KIND
+from dreamfleet.common.runs.seeds import CHOOSING_OFFSET
 from dreamfleet.coordinator.jobs.work import Work
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
 from dreamfleet.coordinator.storage.checksum_records import ChecksumRecords
@@ -18,6 +19,8 @@ from dreamfleet.coordinator.storage.result_records import COLUMNS, ResultRecords
 # Why a result does not count: its host is barred, its generation was dropped, or its closed race did not want it.
 BARRED, REWOUND, SURPLUS = "barred", "rewound", "surplus"
 WAS_CLOSED = "EXISTS (SELECT 1 FROM generation WHERE number = result.generation AND closed IS NOT NULL)"
+CONFIRMS = f"kind = 'evaluate' AND episode >= {CHOOSING_OFFSET}"  # of a row that only chose and confirmed the report
+KIND = f"CASE WHEN {CONFIRMS} THEN 'confirm' ELSE kind END"
 HOST = "substr(worker, 1, instr(worker || '/', '/') - 1)"
 
 
@@ -38,8 +41,9 @@ class RecallRecords:
         """The first generation to which these hosts brought a result or a lasting failure, by kind.
 
         Or in which they alone confirmed a result: of hosts that lie alike, each confirms what the other brings.
+        `confirm` is the kind of episodes that are part of no evaluation: they chose and confirmed the report.
         """
-        query = f"SELECT kind, min(generation) FROM result WHERE {_of(hosts)} GROUP BY 1"  # noqa: S608
+        query = f"SELECT {KIND}, min(generation) FROM result WHERE {_of(hosts)} GROUP BY 1"  # noqa: S608
         first: dict[str, int] = dict(self._journal.read(query, *hosts))
         for _, kind, generation in (*self._failures_of(hosts), *self._confirmed_by(hosts)):
             first[kind] = min(generation, first.get(kind, generation))
@@ -53,7 +57,7 @@ class RecallRecords:
             "(SELECT vector FROM evaluation WHERE generation IN "
         )
         failed = self._failures_of(hosts)
-        write(f"{reopened} (SELECT generation FROM result WHERE kind = 'evaluate' AND {mine}))", *hosts)  # noqa: S608
+        write(f"{reopened} (SELECT generation FROM result WHERE {KIND} = 'evaluate' AND {mine}))", *hosts)  # noqa: S608
         others = (*failed, *self._confirmed_by(hosts))
         self._journal.write_all(f"{reopened} (?))", [(number,) for _, kind, number in others if kind == "evaluate"])
         self._journal.write_all("DELETE FROM failure WHERE digest = ?", [(digest,) for digest, *_ in failed])
@@ -141,7 +145,7 @@ class RecallRecords:
 
     def _failures_of(self, hosts: Collection[str]) -> list[tuple[bytes, str, int]]:
         """Digest, kind and generation of the lasting failures to which any of these hosts contributed."""
-        rows = self._journal.read("SELECT digest, kind, generation, workers FROM failure")
+        rows = self._journal.read(f"SELECT digest, {KIND}, generation, workers FROM failure")  # noqa: S608
         return [
             (digest, kind, generation)
             for digest, kind, generation, workers in rows
@@ -150,8 +154,9 @@ class RecallRecords:
 
     def _confirmed_by(self, hosts: Collection[str]) -> list[tuple[bytes, str, int]]:
         """Digest, kind and generation of the results that were checked, and by nobody else than these hosts."""
-        query = "SELECT digest, kind, generation, checker FROM verification WHERE stands AND outcome != 'unchecked'"
-        rows = self._journal.read(query)
+        kind = f"CASE WHEN digest IN (SELECT digest FROM result WHERE {CONFIRMS}) THEN 'confirm' ELSE kind END"  # noqa: S608
+        query = f"SELECT digest, {kind}, generation, checker FROM verification"  # noqa: S608
+        rows = self._journal.read(f"{query} WHERE stands AND outcome != 'unchecked'")
         return [tuple(checked) for *checked, checkers in rows if set(checkers.split(",")) <= set(hosts)]
 
     def _set_aside(self, because: str, where: str, *values: object) -> None:

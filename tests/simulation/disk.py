@@ -20,6 +20,7 @@ from dreamfleet.common.protocol.messages import Job, Kind, Result
 from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_paths import JOURNAL
+from dreamfleet.common.runs.seeds import CHOOSING_OFFSET
 from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.jobs.checks import Answer
 from dreamfleet.coordinator.jobs.confirmation import Finalist
@@ -163,11 +164,11 @@ class MemoryRecalls:
 
     def first_brought(self, hosts: Collection[str]) -> dict[str, int]:
         first: dict[str, int] = {}
-        for job, _, worker, _ in self.tables.rows["result"].values():
-            if host_of(worker) in hosts:
-                first[job.kind] = min(job.generation, first.get(job.kind, job.generation))
-        for job in (*(job for job, _ in self._failures_of(hosts).values()), *self._confirmed_by(hosts)):
-            first[job.kind] = min(job.generation, first.get(job.kind, job.generation))
+        brought = [job for job, _, worker, _ in self.tables.rows["result"].values() if host_of(worker) in hosts]
+        failed = [job for job, _ in self._failures_of(hosts).values()]
+        for job in (*brought, *failed, *self._confirmed_by(hosts)):
+            kind = _kind_of(job)
+            first[kind] = min(job.generation, first.get(kind, job.generation))
         return first
 
     def _confirmed_by(self, hosts: Collection[str]) -> list[Job]:
@@ -183,7 +184,7 @@ class MemoryRecalls:
     def recall(self, hosts: Collection[str]) -> int:
         mine = {digest: row for digest, row in self.tables.rows["result"].items() if host_of(row[2]) in hosts}
         jobs = [*(row[0] for row in mine.values()), *self._confirmed_by(hosts)]
-        reopened = {job.generation for job in jobs if job.kind == "evaluate"}
+        reopened = {job.generation for job in jobs if _kind_of(job) == "evaluate"}
         vectors = {each.vector for number, (each, _) in self.tables.rows["evaluation"].items() if number in reopened}
         for number, (evaluation, _) in list(self.tables.rows["evaluation"].items()):
             if evaluation.vector in vectors:
@@ -406,6 +407,11 @@ class MemoryJournal:
 def _asked(vectors: tuple[bytes, ...]) -> dict[str, Any]:
     """Columns of a population none of which was drawn anew."""
     return {"vectors": vectors, "first": vectors, "redrawn": ()}
+
+
+def _kind_of(job: Job) -> str:
+    """The kind of a job; of one that chooses or confirms the report, its own."""
+    return "confirm" if job.kind == "evaluate" and job.episode >= CHOOSING_OFFSET else job.kind
 
 
 def _is_behind(job: Job, number: int) -> bool:

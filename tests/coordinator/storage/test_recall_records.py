@@ -2,11 +2,14 @@
 
 import pytest
 
+from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.records import StoredEvaluation
 from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.seeds import CHOOSING_OFFSET, validation_seeds
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.generation import Generation
+from dreamfleet.coordinator.jobs.work import make_work
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.support.run_bench import SETTINGS
 from tests.support.samples import SPEC
@@ -104,6 +107,21 @@ def test_an_evaluation_of_which_a_barred_host_alone_confirmed_a_part_is_finished
         journal.finish_evaluation(number, StoredEvaluation(number, 1, 1.0, 0.0), 0)
     journal.recalls.recall({"b"})
     assert [each.generation for each in journal.pending_evaluations()] == [0]
+
+
+def test_who_only_confirmed_the_report_decided_about_no_candidate_and_no_evaluation(journal):
+    journal.schedule_evaluation(Evaluation(0, VECTORS[0], 1))
+    seeds = validation_seeds(2, CHOOSING_OFFSET)
+    scored, failed = (each.job for each in make_work(SPEC, "evaluate", 0, 0, VECTORS[0], seeds, first=CHOOSING_OFFSET))
+    journal.results.add(scored, Result(scored.digest, 1.0, 10, 0.1, None, None), "c/1", "f", 1, "class")
+    journal.verification.add(scored, "c/1", "d", "equal")
+    journal.add_failure(failed, Failure("no score", ""), ["e/1"], 1)
+    journal.finish_evaluation(0, StoredEvaluation(0, 1, 1.0, 0.0), 0)
+    for host in "dec":
+        assert journal.recalls.first_brought({host}) == {"confirm": 0}
+        journal.recalls.recall({host})
+        assert not journal.pending_evaluations()
+    assert not journal.read("SELECT 1 FROM failure UNION SELECT 1 FROM result WHERE kind = 'evaluate'")
 
 
 @pytest.mark.parametrize(("barred", "stands"), [("b", True), ("c", True), ("bc", True), ("b c", False)])
