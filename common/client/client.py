@@ -58,13 +58,13 @@ class Client(Displayed):
         if not network.connect:
             raise UsageError("a client needs an address: tcp/HOST:PORT")
         self._where = ", ".join(network.connect)
-        self._secured = network.credentials is not None
+        self._credentials = network.credentials
         #: the flags with which a worker joins a run here; in a secured fleet each worker has its own join file
         self.worker_flags = "--join FILE" if network.credentials else f"--connect {' '.join(network.connect)}"
         self.session = open_session(network)  # public: for other queries, such as for a bundle
 
     def _display(self) -> tuple[str, dict[str, object]]:
-        with_join_file = "with a join file" if self._secured else "without a join file"
+        with_join_file = "with a join file" if self._credentials else "without a join file"
         return f"Client of {self._where}, {with_join_file}", {"router": self._where, "access": with_join_file}
 
     def __enter__(self) -> Client:
@@ -86,6 +86,7 @@ class Client(Displayed):
 
         Answers that are no status are left out: one run must not hide the others.
         """
+        self.check_join_file()
         found = []
         for payload in query_all(self.session, [keys.status("*")], timeout):
             with suppress(MalformedError):
@@ -250,14 +251,20 @@ class Client(Displayed):
             whose, again = f"run {run!r}", f"--resume {run}` continues one that was stopped or killed"
             with suppress(DreamfleetError):
                 others = [each for each in self.runs(NAMES_TIMEOUT) if each != run]
-        right = ", or the join file gives no right to ask" if self._secured else ""
+        right = ", or the join file gives no right to ask" if self._credentials else ""
         there = f"what is served there: {join_some(others, SHOWN_RUNS)}; " if others else ""
         return ConnectionFailedError(
             f"no coordinator of {whose} answers through {self._where}: it is not running{right}; {there}"
             f"`dreamfleet coordinator {again}"
         )
 
+    def check_join_file(self) -> None:
+        """`AccessError` if its join file has expired since: a router that ends such a link does not say why."""
+        if self._credentials:
+            self._credentials.check_time("the join file")
+
     def _query(self, selector: str) -> list[dict[str, Any]]:
+        self.check_join_file()
         return [read_document(payload) for payload in query_all(self.session, [selector], QUERY_TIMEOUT)]
 
 

@@ -101,7 +101,7 @@ def _describe_stored(runs_dir: Path, name: str | None) -> str:
         if run.ended:
             return f"run {name} on this disk has ended after {run.ended}: `dreamfleet runs show {name}`"
         if run.state == "live":
-            return f"run {name} on this disk is served at another address"
+            return f"run {name} on this disk is live: at another address, just starting, or closed to this join file"
         return f"run {name} on this disk was stopped or killed: `{resume_command(run.path)}`"
     return ""
 

@@ -78,6 +78,15 @@ class Credentials:
         """The time until it expires, by this host's clock."""
         return self.expires - datetime.now(UTC)
 
+    def check_time(self, what: str) -> None:
+        """`AccessError` if it has expired; `what` names it, such as its file."""
+        if self.time_left <= timedelta():
+            raise AccessError(
+                f"{what} expired on {self.expires:%Y-%m-%d}, and this host's clock says "
+                f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC: set the clock if that is wrong, else have "
+                f"{self.role} {self.name} issued again"
+            )
+
 
 def issue_command(role: str, name: str) -> str:
     """The command by which a join file of this role is issued, in full; a listener is reached by names."""
@@ -133,12 +142,7 @@ def read_join_file(path: Path) -> Credentials:
         raise AccessError(f"{path} is not a join file: it is not TOML; have another issued") from error
     _check_private(path, found)
     credentials = _parse_credentials(path, document)
-    if credentials.time_left <= timedelta():
-        raise AccessError(
-            f"{path} expired on {credentials.expires:%Y-%m-%d}, and this host's clock says "
-            f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC: set the clock if that is wrong, else have "
-            f"{credentials.role} {credentials.name} issued again"
-        )
+    credentials.check_time(str(path))
     return credentials
 
 

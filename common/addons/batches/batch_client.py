@@ -9,6 +9,7 @@ from typing import Any
 
 import zenoh
 
+from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.batches import (
@@ -30,13 +31,13 @@ GRACE = 2.0  # seconds after the timeout to wait for Zenoh's end-of-replies sign
 
 
 class BatchClient:
-    """Queries the coordinator of any run through an open `session`.
+    """Queries the coordinator of any run through a `client`.
 
-    `ConnectionFailedError` if no coordinator answers, `BatchError` if it refuses.
+    `ConnectionFailedError` if no coordinator answers, `BatchError` if it refuses, `AccessError` if the join file ended.
     """
 
-    def __init__(self, session: zenoh.Session) -> None:
-        self._session = session
+    def __init__(self, client: Client) -> None:
+        self._client, self._session = client, client.session
 
     def submit(self, run: str, header: BatchHeader, body: bytes) -> BatchReply:
         """Send a batch; the reply says that it is durable. Sending it again changes nothing."""
@@ -78,6 +79,7 @@ class BatchClient:
 
     def _query(self, run: str, verb: str, sent: Sequence[tuple[str, bytes | None]]) -> list[BatchReply]:
         """The reply to each of these queries, which are sent at once; the first refusal is raised."""
+        self._client.check_join_file()
         replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
         key = keys.batch(keys.check_run_name(run), verb)
         for parameters, payload in sent:

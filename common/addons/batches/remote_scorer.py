@@ -54,7 +54,7 @@ class RemoteScorer(Displayed):
         self.run = run
         self.patience = patience
         self._client = Client(connect)
-        self._batches = BatchClient(self._client.session)
+        self._batches = BatchClient(self._client)
         self._changed = threading.Condition()
         self._events: dict[str, BatchEvent] = {}
         self._subscriber = self._batches.on_change(run, self._take_event)

@@ -87,7 +87,7 @@ class _Handlers:
     """The request handlers; what waits for Zenoh runs in threads."""
 
     def __init__(self, client: Client, changes: Changes, description: dict[str, Any]) -> None:
-        self._client, self._batches = client, BatchClient(client.session)
+        self._client, self._batches = client, BatchClient(client)
         self._changes, self._description = changes, description
         self._seen: set[str] = set()  # runs whose coordinators have answered: theirs may be resumed
         self.streams = 0  # that are open

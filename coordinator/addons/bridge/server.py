@@ -34,7 +34,7 @@ def serve(config: BridgeConfig, network: Network, on_ready: Callable[[str], None
         except KeyboardInterrupt:
             return
         with client:
-            changes = Changes(BatchClient(client.session))
+            changes = Changes(BatchClient(client))
             app = make_app(client, changes, tokens, is_loopback=config.is_loopback)
             url = config.url(listening.getsockname()[1])
             server.serve(app, listening, lambda: on_ready(url), changes.close, KEEP_ALIVE)

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from dreamfleet.common.addons.analysis.elites import RunArchive
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.client.status import Population, Status, WorkerStatus, read_document, read_status
-from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, HandshakeRejectedError
+from dreamfleet.common.errors import AccessError, ConnectionFailedError, DreamfleetError, HandshakeRejectedError
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
@@ -106,7 +106,7 @@ class Watcher:
                 heard = enqueue_into(self._final_statuses, "status", max_waiting=MOST_RUNS)
                 self._client.session.declare_subscriber(keys.event_status("*"), heard)
             found = self._client.statuses(ANSWER_TIMEOUT)
-        except (HandshakeRejectedError, MalformedError) as error:
+        except (AccessError, HandshakeRejectedError, MalformedError) as error:
             self._problem = str(error)
             return {}
         except ConnectionFailedError:

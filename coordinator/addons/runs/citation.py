@@ -86,9 +86,10 @@ def _rows(
     yield "score", view.score
     warm = "" if spec.temperature is None else f", temperature {spec.temperature:g}"
     warm += f", end {spec.end}" if spec.end else ""
-    generations = plural(receipt.generations, "generation")
+    history = run.history()
+    generations = plural(len(history), "generation")
     if settings.stages:  # each has a horizon, a population and more of its own
-        begun = begun_stages(settings, run.history(), run.evaluations())
+        begun = begun_stages(settings, history, run.evaluations())
         yield "task", f"{spec.task}{warm}, version {spec.version}"
         yield "search", f"{settings.optimiser}, {settings.covariance}, {generations}"
         yield from describe_stages(settings, begun).items()
@@ -97,7 +98,6 @@ def _rows(
         size = f"population {settings.population} x {plural(settings.episodes, 'episode')}, sigma0 {settings.sigma0:g}"
         own = f"{settings.optimiser}, {settings.covariance}, {size}, {generations}"
         yield "search", f"{SUBMITTED}, {generations}" if settings.is_external else own
-    history = run.history()
     yield "failed candidates", describe_failed(settings, history, run.count_reseeds(history))
     so_far = "" if run.ended else "; so far, with the results of the open generation"
     yield "spent", f"{run.total_effort().describe(run.spec.task)}{so_far}"
@@ -155,7 +155,7 @@ def _bibtex(run: RunFolder, controller: Controller, receipt: RunProvenance) -> l
         f"  title = {{Run {run.name} of dreamfleet {version}}},",
         *([] if begun is None else [f"  year = {{{begun.year}}},"]),
         "  note = "
-        f"{{run {run.uid}, controller SHA-256 {controller.sha256}, {plural(receipt.generations, 'generation')}}}",
+        f"{{run {run.uid}, controller SHA-256 {controller.sha256}, {plural(len(run.history()), 'generation')}}}",
         "}",
         "@misc{dreamfleet,",
         ",\n".join(f"  {name} = {{{text}}}" for name, text in _software_fields(receipt) if text),

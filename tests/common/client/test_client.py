@@ -3,15 +3,19 @@
 import json
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from time import monotonic
 
 import pytest
 
+from dreamfleet.common.addons.batches.batch_client import BatchClient
 from dreamfleet.common.addons.frames.live import LiveView
 from dreamfleet.common.client.client import Client
+from dreamfleet.common.errors import AccessError
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import encode_json
 from dreamfleet.common.schema.validation import MalformedError
+from dreamfleet.common.security.credentials import Credentials
 from dreamfleet.common.transport.session import Network, open_session
 from tests.support.processes import DEADLINE, free_port
 from tests.support.samples import STATUS
@@ -34,6 +38,15 @@ def serving(**answers):
             served.declare_queryable(key, lambda query, said=said: query.reply(query.key_expr, said))
         with Client(endpoint) as client:
             yield served, client
+
+
+def test_a_client_whose_join_file_has_ended_names_that_and_no_dead_run():
+    with serving(whole=encode_json(STATUS)) as (_, client):
+        assert client.status(RUN) == STATUS
+        client._credentials = Credentials("viewer", 1, "anna", datetime.now(UTC) - timedelta(days=1), "")
+        for ask in (client.statuses, lambda: client.status(RUN), lambda: BatchClient(client).list_batches(RUN)):
+            with pytest.raises(AccessError):
+                ask()
 
 
 def test_a_watch_ends_with_the_runs_own_last_status_alone():
