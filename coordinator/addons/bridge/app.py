@@ -39,9 +39,11 @@ from dreamfleet.coordinator.addons.web.guard import Guard
 
 MAX_BODY = 64 << 20  # bytes of a request
 MAX_TEXT = 16 << 20  # bytes of one whose vectors are numbers as text
+MANY = 1 << 16  # commas of such a one: in float32, only seeds are many
 MOST_DISCARDED = 1 << 30  # bytes of a request that is too long, which are read all the same
 MAX_BODIES = 4 * MAX_BODY  # bytes of all requests that are being read
-BODY_TIMEOUT = 10.0  # seconds without a further byte of a request's body
+BODY_TIMEOUT = 10.0  # seconds in which `LEAST` bytes of a request's body arrive, or its end
+LEAST = 1 << 16
 MOST_STREAMS = 256
 KEEP_ALIVE = 10.0  # seconds between two signs of life in a stream of events
 RUN_WAIT = 600.0  # seconds for which a stream waits for a coordinator that does not answer
@@ -170,17 +172,20 @@ class _Handlers:
     @asynccontextmanager
     async def _body(self, request: Request) -> AsyncIterator[bytes]:
         """Read a request's body; an error if it is too long, stops arriving, or too many are being read."""
-        size, chunks, stream = 0, [], request.stream()
+        size, chunks, stream, now = 0, [], request.stream(), asyncio.get_running_loop().time
+        due, wanted = now() + BODY_TIMEOUT, LEAST
         try:
             while True:
                 try:
-                    async with asyncio.timeout(BODY_TIMEOUT):
+                    async with asyncio.timeout_at(due):
                         chunk = await anext(stream, None)
                 except TimeoutError:
-                    raise HTTPException(408, f"no further byte came within {BODY_TIMEOUT:g} s") from None
+                    raise HTTPException(408, f"fewer than {LEAST:,} bytes came within {BODY_TIMEOUT:g} s") from None
                 if chunk is None:
                     break
                 size += len(chunk)
+                if size >= wanted:
+                    due, wanted = now() + BODY_TIMEOUT, size + LEAST
                 if size <= MAX_BODY and self._held + len(chunk) <= MAX_BODIES:
                     self._held += len(chunk)
                     chunks.append(chunk)
@@ -264,8 +269,7 @@ def _parse(body: bytes) -> dict[str, Any]:
             found[name] = value
         return found
 
-    is_text = b'"float32"' not in body
-    if body.count(b"[") > MAX_CANDIDATES + 2 or (is_text and len(body) > MAX_TEXT):
+    if body.count(b"[") > MAX_CANDIDATES + 2 or (len(body) > MAX_TEXT and body.count(b",") > MANY):
         raise BatchError(  # parsing it would stop all others for seconds
             "too large",
             f"a batch has at most {MAX_CANDIDATES:,} vectors, {MAX_TEXT >> 20} MiB as text: "
