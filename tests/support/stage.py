@@ -31,10 +31,11 @@ class Stage:
         self.hands.append(Hand(self.port, self.bundle, task, beside=hand, **more))
         return self.hands[-1]
 
-    def worker(self, endpoint=None, announced=tasks.ALL, **config):
+    def worker(self, endpoint=None, announced=tasks.ALL, network=None, **config):
         """A worker and the future of its `serve`."""
         config = WorkerConfig(**{"run": "test", "slots": 1, **config})
-        made = Worker(config, Network(connect=(endpoint or f"tcp/127.0.0.1:{self.port}",)), announced)
+        network = network or Network(connect=(endpoint or f"tcp/127.0.0.1:{self.port}",))
+        made = Worker(config, network, announced)
         self.workers.append((made, self._threads.submit(made.serve)))
         return self.workers[-1]
 

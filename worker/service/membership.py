@@ -7,6 +7,7 @@ the other, and neither side can reliably notify the other afterwards.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 NEXT_RUN_AFTER = 5.0  # seconds without a coordinator after which an idle worker of any run looks for another
@@ -28,6 +29,7 @@ class LeaveConditions:
     leaves_with_run: bool = False  # whether it leaves when its run has ended
     serves_any: bool = False  # whether it goes on to the next run, then and where the coordinator is gone
     coordinator_timeout: float = math.inf  # seconds without a coordinator after which it gives its run up
+    is_expired: Callable[[], bool] = lambda: False  # by the wall clock, which goes on while this host sleeps
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ class Membership:
 
     def is_leaving(self, now: float) -> bool:
         """Whether this worker accepts neither another job nor another run."""
-        return self._stops.count > 0 or now >= self._ends_at
+        return self._stops.count > 0 or now >= self._ends_at or self.conditions.is_expired()
 
     @property
     def plan_without_coordinator(self) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import queue
 import random
 from collections import Counter
@@ -100,10 +99,10 @@ class Worker:
         self._hello = make_request(
             self.identity, (*known_tasks(), *tasks), self._slot_count, torch_device=config.torch_device
         )
-        lifetime = min(config.lifetime or math.inf, self._seconds_until_expiry)
         self._conditions = LeaveConditions(
-            lifetime, config.drain_timeout, config.exit_when_done, config.any, config.coordinator_timeout
-        )
+            config.lifetime, config.drain_timeout, config.exit_when_done, config.any, config.coordinator_timeout,
+            self._join_file_ends,
+        )  # fmt: skip
         self._started_at, self._stops = monotonic(), StopRequests()
         self._membership = self._new_membership()  # of no run: it says when the whole worker leaves
         self._refusals = RefusalBackoff() if config.any else RefusalBackoff(*SINGLE_RUN_DELAYS)
@@ -129,20 +128,17 @@ class Worker:
             finally:
                 session.close()  # type: ignore[no-untyped-call]
         credentials = self._network.credentials
-        if credentials is not None and self._seconds_until_expiry <= 0:
+        if credentials is not None and self._join_file_ends():
             raise AccessError(
                 f"the join file of {credentials.identity} ({credentials.name}) expires at "
                 f"{credentials.expires:%Y-%m-%d %H:%M} UTC: have it issued again, and start this "
                 "worker with that"
             )
 
-    @property
-    def _seconds_until_expiry(self) -> float:
-        """Seconds until it must start to drain, because links are closed when the join file expires."""
+    def _join_file_ends(self) -> bool:
+        """Whether it must drain, because links are closed when the join file expires."""
         credentials = self._network.credentials
-        if credentials is None:
-            return math.inf
-        return credentials.time_left.total_seconds() - self._config.drain_timeout
+        return credentials is not None and credentials.time_left.total_seconds() <= self._config.drain_timeout
 
     def _new_membership(self) -> Membership:
         return Membership(self._conditions, self._started_at, self._stops)

@@ -98,6 +98,14 @@ def test_it_drains_at_the_end_of_its_lifetime_which_begins_before_any_run():
     assert member.start_draining_if_due(10.0)
 
 
+def test_it_drains_once_its_join_file_ends_by_the_wall_clock_however_little_time_it_was_awake():
+    left = [1.0]
+    member = joined(is_expired=lambda: left[0] <= 0)
+    assert not member.start_draining_if_due(1.0)
+    left[0] = -1.0
+    assert member.start_draining_if_due(1.0)
+
+
 @pytest.mark.parametrize("seen", [True, False])
 def test_a_worker_that_leaves_with_its_run_gives_up_a_coordinator_only_after_long_patience(seen):
     leaves = joined(visible=seen, leaves_with_run=True, coordinator_timeout=TIMEOUT)

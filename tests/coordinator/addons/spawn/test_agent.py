@@ -90,7 +90,7 @@ def test_an_end_that_waited_for_a_removal_leaves_nothing(tmp_path, monkeypatch, 
         take(self, lock)
 
     monkeypatch.setattr(HostFolder, "_acquire", removed)
-    assert answer(ending({"root": host_folder.root}), capsys)["ok"] == {"ended": []}
+    assert answer({**ending({"root": host_folder.root}), "keep": True}, capsys)["ok"] == {"ended": []}
     assert not host_folder.root.exists()
 
 
