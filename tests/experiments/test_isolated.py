@@ -47,24 +47,24 @@ def die(request, stop):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def heed(request, stop):
+def work_until(stop):
     sys.stderr.write("begun\n")
     while not stop():
         time.sleep(0.01)
+
+
+def heed(request, stop):
+    work_until(stop)
     raise StoppedError("7 of 9 are kept")
 
 
 def finish_anyway(request, stop):
-    sys.stderr.write("begun\n")
-    while not stop():
-        time.sleep(0.01)
+    work_until(stop)
     return request.name
 
 
 def ignore(request, stop):
-    sys.stderr.write("begun\n")
-    while True:
-        time.sleep(1)
+    work_until(lambda: False)
 
 
 def stopped_once_begun():

@@ -16,6 +16,10 @@ from tests.support.lying_tasks import LIES
 from tests.support.processes import free_port, until
 
 FEW = {"workers": 1, "popsize": 8}
+CALLED_OTHERWISE = {
+    "budget": "maxfevals", "maxiter": "generations", "maxfeval": "maxfevals", "call_back": "callback",
+    "sigma": "sigma0", "n_jobs": "workers", "tol": "ftarget",
+}  # fmt: skip
 
 
 def stop_kind(found, runs_dir):
@@ -205,19 +209,13 @@ def test_a_callback_ends_the_search_and_all_numbers_are_of_one_moment(tmp_path):
         ({"sigma0": None}, " 0"),
         ({"bounds": (0.2, 0.8), "x0": [0.5, 0.5], "integer": True}, "0.2 .*0.8"),
         ({"nothing": 3}, "'nothing'"),
-        ({"budget": 3}, "'budget'.* 'maxfevals'"),
-        ({"maxiter": 3}, "'generations'"),
-        ({"maxfeval": 3}, "'maxfevals'"),
-        ({"call_back": print}, "'callback'"),
-        ({"sigma": 3}, "'sigma0'"),
-        ({"n_jobs": 3}, "'workers'"),
         ({"args": (3,)}, r"functools\.partial"),
         ({"bounds": [(0, 0), (0, 0)]}, "."),
-        ({"tol": 3}, "'ftarget'"),
         ({"disp": True}, "`callback=print`"),
         ({"seed": "x"}, "'x'"),
         ({"function": objectives.raising}, "raising.* ZeroDivisionError"),
         ({"function": "tests.support.objectives:nowhere"}, "nowhere"),
+        *(({wrong: 3}, f"'{wrong}'.* '{right}'") for wrong, right in CALLED_OTHERWISE.items()),
     ],
 )
 def test_what_cannot_be_searched_is_refused_before_a_run_exists(change, named, tmp_path):

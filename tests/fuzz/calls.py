@@ -63,11 +63,7 @@ class Call:
 def parsers(only=None):
     """The parsers of all registered verbs, or of those whose name begins with `only`."""
     points = sorted(entry_points(group=GROUP), key=lambda each: each.name)
-    return {
-        each.name: build_parser(each.name, load_verb(each))
-        for each in points
-        if only is None or each.name.startswith(only)
-    }
+    return {each.name: build_parser(each.name, load_verb(each)) for each in points if each.name.startswith(only or "")}
 
 
 def flags_with_values(parser):
@@ -85,11 +81,9 @@ def one_value_calls(verb, parser, values=VALUES):
     for value in values:
         for flag in flags_with_values(parser):
             yield Call(verb, (*valid, f"{flag}={value}"))
-        places = [
-            at for at, word in enumerate(valid) if not word.startswith("-") and (at == 0 or valid[at - 1][0] != "-")
-        ]
-        for at in places:
-            yield Call(verb, (*valid[:at], value, *valid[at + 1 :]))
+        for at, word in enumerate(valid):
+            if word[0] != "-" and (at == 0 or valid[at - 1][0] != "-"):
+                yield Call(verb, (*valid[:at], value, *valid[at + 1 :]))
         yield Call(verb, (*valid, value))
 
 

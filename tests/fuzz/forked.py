@@ -17,8 +17,7 @@ from pathlib import Path
 from dreamfleet.common.cli import command_line
 
 PRELOADED = ("numpy", "zenoh", "torch", "onnxruntime", "gymnasium", "pygame", "cma", "matplotlib.pyplot", "rich.live")
-SECONDS_TO_END = 20.0  # after Ctrl-C, on a busy machine
-SECOND_CTRL_C = 4.0  # seconds after the first
+SIGNALS = (0.0, signal.SIGINT), (4.0, signal.SIGINT), (20.0, signal.SIGKILL)  # seconds after the limit: Ctrl-C twice
 MOST_MEMORY = 3_000_000  # kilobytes
 MOST_ADDRESSES = 16_000_000_000  # bytes
 MOST_LINES = 6  # of a usage error
@@ -53,21 +52,17 @@ class Child:
         return self._judge(os.waitstatus_to_exitcode(status), usage.ru_maxrss)
 
     def _signal(self, late):
-        for number, (after, sent) in enumerate(
-            ((0, signal.SIGINT), (SECOND_CTRL_C, signal.SIGINT), (SECONDS_TO_END, signal.SIGKILL))
-        ):
+        for number, (after, sent) in enumerate(SIGNALS):
             if late > after and self.signals == number:
                 self.signals += 1
                 os.kill(self.pid, sent)
 
     def _judge(self, code, memory):
-        printed = (self.folder / "stdout").read_bytes() + (self.folder / "stderr").read_bytes()
-        text = printed.decode(errors="replace")
-        lines = (self.folder / "stderr").read_bytes().count(b"\n")
-        found = [
-            word for word in ("Traceback (most", "panicked at", "Exception ignored", "Fatal Python") if word in text
-        ]
-        if self.signals == 3:
+        out, err = ((self.folder / name).read_text(errors="replace") for name in ("stdout", "stderr"))
+        text, lines = out + err, err.count("\n")
+        bugs = "Traceback (most", "panicked at", "Exception ignored", "Fatal Python"
+        found = [word for word in bugs if word in text]
+        if self.signals == len(SIGNALS):
             found.append("it hangs")
         elif code < 0 and not (self.signals and code == -signal.SIGINT):
             found.append(f"ended by signal {-code}")
@@ -107,14 +102,8 @@ def _isolate(folder):
     os.setsid()
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     os.chdir(folder / "work")
-    for number, (name, flags) in enumerate(
-        (
-            (os.devnull, os.O_RDONLY),
-            (folder / "stdout", os.O_CREAT | os.O_WRONLY),
-            (folder / "stderr", os.O_CREAT | os.O_WRONLY),
-        )
-    ):
-        os.dup2(os.open(name, flags, 0o600), number)
+    for number, name in enumerate((os.devnull, folder / "stdout", folder / "stderr")):
+        os.dup2(os.open(name, os.O_CREAT | os.O_WRONLY if number else os.O_RDONLY, 0o600), number)
     sys.stdout = sys.__stdout__ = open(1, "w", closefd=False)  # noqa: SIM115
     sys.stderr = sys.__stderr__ = open(2, "w", buffering=1, closefd=False)  # noqa: SIM115
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import random
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from functools import partial
 from typing import Literal
 
@@ -99,16 +99,13 @@ class Schedule:
         """One line, which `--replay` takes; only what differs from a default is written."""
         plain = Shape()
         shape = {key: value for key, value in asdict(self.shape).items() if value != getattr(plain, key)}
-        rows = [[*asdict(fault).values()] for fault in self.faults]
-        return json.dumps({"name": self.name, "shape": shape, "faults": rows})
+        return json.dumps({"name": self.name, "shape": shape, "faults": [astuple(fault) for fault in self.faults]})
 
     @classmethod
     def from_json(cls, text: str) -> Schedule:
         """What `to_json` wrote."""
         parsed = json.loads(text)
-        known = {field.name for field in fields(Shape)}
-        shape = Shape(**{key: value for key, value in parsed["shape"].items() if key in known})
-        return cls(shape, tuple(Fault(*row) for row in parsed["faults"]), parsed["name"])
+        return cls(Shape(**parsed["shape"]), tuple(Fault(*row) for row in parsed["faults"]), parsed["name"])
 
     def without(self, start: int, end: int) -> Schedule:
         """The same without some of its faults."""
@@ -133,10 +130,8 @@ def _staged(shape: Shape, source: random.Random) -> Shape:
     if source.random() > 0.125:
         return shape
     first, scored, anew = source.choice((1, 2, 3)), source.random() < 0.5, source.random() < 0.5
-    every = 1 if scored else shape.evaluate_every
-    return replace(
-        shape, generations=3, first_stage=first, first_score=1.4 if scored else 0.0, anew=anew, evaluate_every=every
-    )
+    at_score = {"first_score": 1.4, "evaluate_every": 1} if scored else {}
+    return replace(shape, generations=3, first_stage=first, anew=anew, **at_score)
 
 
 def _failing(shape: Shape, source: random.Random) -> Shape:

@@ -80,7 +80,7 @@ def test_redundant_work_is_one_line_unless_it_is_not_zero():
     nothing = replace(STATUS.waste, **{each.name: 0 for each in fields(STATUS.waste)})
     assert shown(waste=nothing, dropped={"malformed": 0})["redundant"] == {"text": "none", "rows": []}
     some = shown(waste=replace(nothing, silences=3), dropped={"bad\x1b": 2})["redundant"]
-    assert some["text"].startswith("0.0%")
+    assert "0.0%" in some["text"]
     assert [count for _, count in some["rows"]] == ["3", "2"]
     assert some["rows"][1][0].endswith("bad\\x1b")
 
