@@ -10,10 +10,11 @@ from typing import Protocol
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import reporting_write_errors
 from dreamfleet.common.files.regular_files import is_file
-from dreamfleet.common.files.tensorboard import EXTRA, open_event_file, read_scalars
+from dreamfleet.common.files.tensorboard import EXTRA, open_event_file
 from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.trusted_modules import import_trusted
 from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.coordinator.addons.sinks.event_files import read_scalars
 from dreamfleet.coordinator.settings.live_log import SinkName, parse_sink
 
 OWNER = "run_uid"  # a file beside TensorBoard's, with the identity of the run that writes there

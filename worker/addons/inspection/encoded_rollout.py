@@ -15,7 +15,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.foreign_code import answer_kept
 from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.seeds import VALIDATION
-from dreamfleet.worker.scoring.actors import check_same_pictures
+from dreamfleet.worker.addons.inspection.drivers import check_same_pictures
 from dreamfleet.worker.scoring.disturbance import numbered_choices
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.api import Assignment, Continuous, Policy, World

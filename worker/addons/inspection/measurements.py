@@ -18,6 +18,7 @@ from dreamfleet.worker.addons.inspection.disturbed_rollouts import (
     DisturbedDriveConfig,
     record_disturbed_drives,
 )
+from dreamfleet.worker.addons.inspection.drivers import make_controller_actor, make_driver_actors
 from dreamfleet.worker.addons.inspection.likeness import compare_frequencies
 from dreamfleet.worker.addons.inspection.measure import (
     FIGURES,
@@ -39,7 +40,7 @@ from dreamfleet.worker.addons.inspection.road_losses import (
 from dreamfleet.worker.addons.inspection.survival import SurvivalConfig, fixed_drivers, measure_survival
 from dreamfleet.worker.dream.batch import DEFAULT_TEMPERATURE
 from dreamfleet.worker.dream.world import world_of
-from dreamfleet.worker.scoring.actors import Actor, make_controller_actor, make_driver_actors
+from dreamfleet.worker.scoring.actors import Actor
 from dreamfleet.worker.tasks.recordable import TaskWithBeginnings
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState

@@ -1,5 +1,5 @@
 """A run's curves in the records of other programs, as its journal has them.
-Tests sinks.py, coordinator/settings/live_log.py and common/files/tensorboard.py."""
+Tests event_files.py, sinks.py, coordinator/settings/live_log.py and common/files/tensorboard.py."""
 
 import json
 import sys
@@ -10,10 +10,11 @@ import pytest
 
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.files.tensorboard import EVENTS, read_scalars
+from dreamfleet.common.files.tensorboard import EVENTS
 from dreamfleet.common.host.packages import hidden
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.addons.runs.export import scalars_of
+from dreamfleet.coordinator.addons.sinks.event_files import read_scalars
 from dreamfleet.coordinator.addons.sinks.live_log import follow, live_log
 from dreamfleet.coordinator.addons.sinks.sinks import check_sinks
 from dreamfleet.coordinator.settings.live_log import SinkName, parse_sink
