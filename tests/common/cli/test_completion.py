@@ -1,5 +1,6 @@
 """`dreamfleet completion` writes scripts that complete in real shells. Tests common/addons/completion.py."""
 
+import re
 import subprocess
 
 import pytest
@@ -40,9 +41,7 @@ def test_bash_completes_verbs_and_flags(script, typed, offered):
     assert offered <= {line.strip() for line in done.stdout.splitlines()}, done.stderr
 
 
-@pytest.mark.parametrize("shell", ["zsh", "fish"])
-def test_other_shells_get_scripts_too(shell, capsys):
-    assert command_line.main(["completion", shell]) == 0
-    text = capsys.readouterr().out
-    assert "coordinator" in text
-    assert "population" in text
+def test_other_shells_get_scripts_too(capsys):
+    for shell in ("zsh", "fish"):
+        assert command_line.main(["completion", shell]) == 0
+        assert re.search("coordinator.*population", capsys.readouterr().out, re.DOTALL)

@@ -26,7 +26,6 @@ def test_each_that_is_registered_loads():
 def test_one_whose_folder_is_gone_is_absent(value, registered):
     registered(value)
     assert find_add_on("card") is None
-
     with pytest.raises(UsageError):
         add_on("card")
 

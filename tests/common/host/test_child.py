@@ -6,50 +6,26 @@ import sys
 import pytest
 
 from dreamfleet.common.host.child import CommandChild, FunctionChild
-from tests.support.processes import DEADLINE, ends
+from tests.support.processes import DEADLINE
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "pidfd_open"), reason="Linux")
 DEAF = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); signal.pause()"
 
 
-def leave_one(pipe):
-    """Say which process was left behind, then wait."""
-    reading, writing = os.pipe()
-    if os.fork() == 0:
-        os.setsid()
-        if os.fork() == 0:
-            os.write(writing, b"%d" % os.getpid())
-            signal.pause()
-        os._exit(0)
-    os.wait()
-    pipe.send((os.getpgid(0), int(os.read(reading, 20))))
-    signal.pause()
-
-
 def echo(pipe, number):
-    pipe.send(2 * number)
+    pipe.send((2 * number, os.getpgid(0)))
     pipe.send(pipe.recv())
 
 
 def test_a_function_talks_to_its_parent_and_its_end_is_heard():
     messages = queue.SimpleQueue()
     with FunctionChild(echo, 21, on_message=messages.put) as child:
-        assert messages.get(timeout=DEADLINE) == 42
+        assert messages.get(timeout=DEADLINE) == (42, child.pid), "in a session of its own"
+        assert child.memory > 0
         assert child.send("again")
         assert [messages.get(timeout=DEADLINE) for _ in range(2)] == ["again", None]
         assert child.wait(DEADLINE)
         assert child.exit_code == 0
-
-
-def test_what_left_its_session_and_parent_ends_with_the_child():
-    messages = queue.SimpleQueue()
-    with FunctionChild(leave_one, on_message=messages.put) as child:
-        group, left = messages.get(timeout=DEADLINE)
-        pidfd = os.pidfd_open(left)
-        assert group == child.pid
-        assert child.memory > 0
-    assert child.exit_code == -signal.SIGKILL
-    assert ends(pidfd)
 
 
 @pytest.mark.parametrize("is_own", [True, False])

@@ -8,14 +8,13 @@ import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
-from time import monotonic, sleep
 
 import pytest
 
 from dreamfleet.common.addons.task_check import dry_run_process
 from dreamfleet.common.addons.task_check.task_check import try_task
 from tests.support.environments import DAEMON_FILE, ODD
-from tests.support.processes import DEADLINE, ends, environment, started
+from tests.support.processes import DEADLINE, ends, environment, started, until
 from tests.support.stuck_environments import MODULE as STUCK
 
 
@@ -131,9 +130,7 @@ def test_a_signal_ends_the_verb_with_all_that_the_environment_left(number, tmp_p
         [sys.executable, "-m", "dreamfleet", "tasks", ODD, "--environment", 'fault="daemon and hang"'],
         env={**environment(tmp_path), DAEMON_FILE: str(file)}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     ) as verb:  # fmt: skip
-        until = monotonic() + DEADLINE
-        while not (file.exists() and file.read_text()) and verb.poll() is None and monotonic() < until:
-            sleep(0.01)
+        until(lambda: (file.exists() and file.read_text()) or verb.poll() is not None)
         daemon = os.pidfd_open(int(file.read_text()))
         verb.send_signal(number)
         printed, _ = verb.communicate(timeout=DEADLINE)
