@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Collection, Iterable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Collection
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from dreamfleet.common.errors import AccessError
-from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import read_regular
 from dreamfleet.common.schema.validation import MalformedError, Moment, from_plain
 from dreamfleet.common.security.credentials import Credentials, identity, issue_command
@@ -63,23 +62,9 @@ class CertificateLedger:
         except (ValueError, RecursionError, MalformedError) as error:
             raise AccessError(f"{path} is damaged: {error}; restore it") from error
 
-    def save(self, path: Path) -> None:
-        """Write the ledger's file atomically; `AccessError` if that fails."""
-        try:
-            with atomic_write(path, private=True) as file:
-                file.write(json.dumps(asdict(self), indent=1).encode())
-        except OSError as error:
-            raise AccessError(f"{path} cannot be written: {error.strerror}; nothing is changed") from error
-
     def revoked_seats(self) -> frozenset[str]:
         """The identities of revoked seats."""
         return frozenset(each.identity for each in self.issued if each.revoked is not None)
-
-    def with_revoked(self, wanted: Iterable[IssuedJoinFile], now: float) -> CertificateLedger:
-        """A copy in which some join files are revoked."""
-        chosen = set(wanted)
-        return replace(self, issued=tuple(replace(each, revoked=now) if each in chosen else each
-                                          for each in self.issued))  # fmt: skip
 
 
 class RevocationWatcher:

@@ -10,12 +10,13 @@ Keys are P-256, which every TLS library supports; certificates are X.509 v3 (RFC
 from __future__ import annotations
 
 import ipaddress
+import json
 import re
 import secrets
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import replace
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -26,17 +27,17 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from dreamfleet.common.errors import AccessError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write, check_output_path, reporting_write_errors
-from dreamfleet.common.files.locks import folder_lock
+from dreamfleet.common.files.locks import open_lock, wait_for_lock
 from dreamfleet.common.files.regular_files import read_regular, read_text
 from dreamfleet.common.protocol.keys import check_worker_name
-from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, CertificateLedger, IssuedJoinFile
+from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, MAX_BYTES, CertificateLedger, IssuedJoinFile
 from dreamfleet.common.security.credentials import SEATS, Credentials, derive_password, format_join_file, hash_authority
 
 AUTHORITY_DAYS = 3650  # validity of the authority's certificate
 DEFAULT_DAYS = {"coordinator": 90, "router": 90, "operator": 90, "viewer": 90, "worker": 30}  # validity of join files
 CLOCK_SKEW = timedelta(minutes=5)  # certificates are valid from so long before their issue
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")  # in the certificate of every listener
-_CERTIFICATE, _KEY, _SECRET = "ca.pem", "ca.key", "secret"
+_FILES = _CERTIFICATE, _KEY, _SECRET, _LIST = "ca.pem", "ca.key", "secret", LEDGER_FILE
 _MAX_FILE_BYTES = 64 * 1024
 _HOST = re.compile(r"(\*\.)?[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*\.?")
 
@@ -47,7 +48,7 @@ class Authority:
     def __init__(self, folder: Path) -> None:
         """Open an existing authority; `AccessError` if there is none, or it is damaged."""
         self._folder = folder
-        if not _authority_exists(folder):
+        if _KEY not in _parts(folder):
             raise AccessError(
                 f"no authority in {folder}: `dreamfleet access init` creates one, --access-dir names another"
             )
@@ -69,22 +70,25 @@ class Authority:
 
     @classmethod
     def create(cls, folder: Path, *, passwords: bool = False) -> Authority:
-        """Create an authority; `UsageError` if the folder holds one."""
-        if _authority_exists(folder):
-            raise UsageError(f"{folder} holds an authority already: name another --access-dir")
+        """Create an authority; `UsageError` if the folder holds one, or a part of one."""
+        _check_vacant(folder)
         key, now = generate_private_key(SECP256R1()), datetime.now(UTC)
         name = _x509_name(f"dreamfleet {secrets.token_hex(4)}")
         pem = _certify(name, name, key, key, x509.random_serial_number(), now, now + timedelta(days=AUTHORITY_DAYS))
         with reporting_write_errors(folder, "--access-dir"):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         with reporting_write_errors(folder, "--access-dir"), _locked(folder):
-            if _authority_exists(folder):
-                raise UsageError(f"{folder} holds an authority already: name another --access-dir")
-            _write_private(folder / _CERTIFICATE, pem.encode())
-            if passwords:
-                _write_private(folder / _SECRET, secrets.token_hex(32).encode())
-            CertificateLedger(hash_authority(pem), passwords).save(folder / LEDGER_FILE)
-            _write_private(folder / _KEY, _key_bytes(key))  # last: its presence marks a complete authority
+            _check_vacant(folder)
+            try:
+                _write_private(folder / _CERTIFICATE, pem.encode())
+                if passwords:
+                    _write_private(folder / _SECRET, secrets.token_hex(32).encode())
+                save_ledger(CertificateLedger(hash_authority(pem), passwords), folder)
+                _write_private(folder / _KEY, _key_bytes(key))  # last: its presence marks a complete authority
+            except BaseException:  # so that the next attempt finds the folder vacant
+                for each in _FILES:
+                    (folder / each).unlink(missing_ok=True)
+                raise
         return cls(folder)
 
     def issue(
@@ -115,8 +119,12 @@ class Authority:
                 who = (replace(who, secret=self._secret) if who.can_listen
                        else replace(who, password=derive_password(self._secret, who.identity)))  # fmt: skip
             entry = IssuedJoinFile(role, seat, name, f"{serial:x}" if who.certificate else "", who.expires.timestamp())
-            # Before the file: what is out is known.
-            replace(ledger, issued=(*ledger.issued, entry)).save(self._folder / LEDGER_FILE)
+            # What has expired opens nothing; a revoked seat stays known, and a name's seat by its last file.
+            moment = now.timestamp()
+            kept = (each for each in ledger.issued
+                    if (each.identity, each.revoked) != (who.identity, None) or each.expires > moment)  # fmt: skip
+            # Before the file: what is out is known. And all of them can still be revoked, which takes more bytes.
+            save_ledger(replace(ledger, issued=(*kept, entry)), self._folder, limit=MAX_BYTES * 4 // 5)
             with reporting_write_errors(out):
                 _write_private(out, format_join_file(who).encode())
         return who
@@ -133,7 +141,7 @@ class Authority:
                 raise UsageError(f"nothing is issued to {name!r} that is not revoked: see `dreamfleet access list`")
             if len(roles := sorted({each.role for each in found})) > 1:
                 raise UsageError(f"{name!r} is the name of {' and '.join(roles)}: say which with --role")
-            ledger.with_revoked(found, time.time()).save(self._folder / LEDGER_FILE)
+            save_ledger(with_revoked(ledger, found, time.time()), self._folder)
             return tuple(found)
 
     def _sign_certificate(
@@ -151,23 +159,55 @@ class Authority:
     @contextmanager
     def _locked_ledger(self) -> Iterator[CertificateLedger]:
         """Load the ledger and lock it against changes."""
-        with _locked(self._folder):
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(_locked(self._folder))
+            except OSError as error:
+                raise AccessError(f"{self._folder} cannot be written: {error.strerror}; nothing is changed") from error
             ledger = CertificateLedger.load(self._folder / LEDGER_FILE)
             if ledger.authority != hash_authority(self._pem):
                 raise AccessError(f"{self._folder / LEDGER_FILE} belongs to another authority: restore the folder")
             yield ledger
 
 
-def _authority_exists(folder: Path) -> bool:
-    """Whether a folder holds an authority; `AccessError` if it cannot be read."""
+def save_ledger(ledger: CertificateLedger, folder: Path, limit: int = MAX_BYTES) -> None:
+    """Write a ledger's file atomically; `AccessError` if that fails, or takes more than `limit` bytes."""
+    path, data = folder / LEDGER_FILE, json.dumps(asdict(ledger), indent=1).encode()
+    if len(data) > limit:
+        raise AccessError(f"{path} is full: create another authority with `dreamfleet access init`")
     try:
-        return (folder / _KEY).exists()
+        _write_private(path, data)
+    except OSError as error:
+        raise AccessError(f"{path} cannot be written: {error.strerror}; nothing is changed") from error
+
+
+def with_revoked(ledger: CertificateLedger, wanted: Iterable[IssuedJoinFile], now: float) -> CertificateLedger:
+    """A copy of a ledger in which some join files are revoked."""
+    chosen = set(wanted)
+    return replace(ledger, issued=tuple(replace(each, revoked=now) if each in chosen else each
+                                        for each in ledger.issued))  # fmt: skip
+
+
+def _parts(folder: Path) -> list[str]:
+    """The files of an authority that a folder holds; `AccessError` if it cannot be read."""
+    try:
+        return [name for name in _FILES if (folder / name).exists()]
     except OSError as error:
         raise AccessError(f"the authority in {folder} cannot be read: {error.strerror}") from error
 
 
-def _locked(folder: Path) -> AbstractContextManager[None]:
-    return folder_lock(folder / "lock", "`dreamfleet access`", "--access-dir")
+def _check_vacant(folder: Path) -> None:
+    """`UsageError` if a folder holds an authority, or a part of one: a copy of its list, or all but its key."""
+    if found := _parts(folder):
+        raise UsageError(f"{folder} holds {', '.join(found)} of an authority already: name another --access-dir")
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the folder's lock; waits for another command, which takes a moment."""
+    with open_lock(folder / "lock") as file:
+        wait_for_lock(file)
+        yield
 
 
 def _assign_seat(ledger: CertificateLedger, role: str, name: str) -> int:

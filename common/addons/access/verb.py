@@ -75,8 +75,8 @@ def issue_join_file(args: argparse.Namespace) -> int:
         raise UsageError(f"a {args.role} connects: give --connect tls/HOST:7447, and no --host")
     if args.role in LISTENERS and not args.host and not args.endpoints:
         raise UsageError(f"a {args.role} is reached by names: give --host, or --connect where a router listens for it")
-    if args.days is not None and not 0 < args.days <= 3650:
-        raise UsageError(f"--days must be above 0 and at most 3650, not {args.days:g}")
+    if args.days is not None and not 0.001 <= args.days <= 3650:
+        raise UsageError(f"--days must be from 0.001 to 3650, not {args.days:g}")
     issued = Authority(args.global_config.access_dir).issue(
         args.role, args.name, args.out, connect=args.endpoints, hosts=args.host, days=args.days
     )

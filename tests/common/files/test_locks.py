@@ -12,12 +12,18 @@ from dreamfleet.common.files.locks import folder_lock
 from dreamfleet.common.files.regular_files import _Readable
 from dreamfleet.common.runs.run_lock import is_run_locked, run_lock
 from dreamfleet.coordinator.addons.runs import backup
-from dreamfleet.coordinator.addons.spawn.agent import Channel, FailedError, HostFolder
+from dreamfleet.coordinator.addons.spawn.agent import CREATED, Channel, FailedError, HostFolder
+
+
+def lock_of_agent(folder):
+    (folder / CREATED).write_text("[]")
+    return HostFolder(str(folder), Channel()).locked()
+
 
 LOCKS = {
     "folder": (lambda folder: folder_lock(folder / "lock", "`dreamfleet access`"), "lock"),
     "run": (run_lock, "lock"),
-    "agent": (lambda folder: HostFolder(str(folder), Channel()).locked(), "lock"),
+    "agent": (lock_of_agent, "lock"),
     "backup": (lambda folder: backup._backup_lock(folder / "night"), ".night.lock"),
 }
 

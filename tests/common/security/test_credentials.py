@@ -8,18 +8,20 @@ import re
 import shutil
 import socket
 import stat
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from itertools import count
 from pathlib import Path
 from threading import Event
 
 import pytest
 
 from dreamfleet.common.addons.access import authority
-from dreamfleet.common.addons.access.authority import Authority
+from dreamfleet.common.addons.access.authority import Authority, save_ledger, with_revoked
 from dreamfleet.common.addons.router import router
 from dreamfleet.common.cli.command_line import main
-from dreamfleet.common.errors import AccessError, UsageError
+from dreamfleet.common.errors import AccessError, DreamfleetError, UsageError
 from dreamfleet.common.security import certificate_ledger
 from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, CertificateLedger, RevocationWatcher
 from dreamfleet.common.security.credentials import MAX_BYTES, add_seat_to_name, read_join_file, worker_seat_identity
@@ -113,7 +115,7 @@ def revoked(access, tmp_path):
     folder = tmp_path / "revoked"
     folder.mkdir()
     ledger = CertificateLedger.load(access._folder / LEDGER_FILE)
-    ledger.with_revoked([each for each in ledger.issued if each.name == "box"], 1.0).save(folder / LEDGER_FILE)
+    save_ledger(with_revoked(ledger, [each for each in ledger.issued if each.name == "box"], 1.0), folder)
     return folder
 
 
@@ -133,7 +135,7 @@ def test_a_revocation_is_seen_and_final_whatever_becomes_of_the_ledger(access, j
     ledger.write_text("{")
     with pytest.raises(AccessError, match=LEDGER_FILE):  # who begins with it would let everybody in
         RevocationWatcher(folder, own)
-    replace(CertificateLedger.load(older), authority="0" * 64).save(ledger)
+    save_ledger(replace(CertificateLedger.load(older), authority="0" * 64), ledger.parent)
     with pytest.raises(AccessError, match="--access-dir"):
         RevocationWatcher(folder, own)
 
@@ -253,6 +255,55 @@ def test_a_full_disk_changes_nothing_and_an_unreadable_folder_is_an_error(access
     ):
         with pytest.raises(AccessError, match="Permission denied"):
             looked()
+
+
+@pytest.mark.parametrize("held", [(LEDGER_FILE,), ("ca.pem", LEDGER_FILE), ("secret",)])
+def test_a_folder_with_a_part_of_an_authority_keeps_it(access, tmp_path, held):
+    for name in held:
+        (tmp_path / name).write_bytes(b"mine")
+    with pytest.raises(UsageError, match=held[0]):
+        Authority.create(tmp_path, passwords=True)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == dict.fromkeys(held, b"mine")
+
+
+def test_an_authority_whose_making_failed_can_be_made_again(tmp_path, monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.setattr(authority, "_key_bytes", failing(errno.ENOSPC))
+        with pytest.raises(DreamfleetError, match="No space left"):
+            Authority.create(tmp_path, passwords=True)
+    Authority.create(tmp_path, passwords=True)
+
+
+def test_a_list_keeps_what_is_valid_or_revoked_or_a_names_last_and_never_grows_too_large(tmp_path, monkeypatch):
+    made, numbers = Authority.create(tmp_path / "access"), count()
+
+    def issue(name, age=0):
+        when = datetime.now(UTC) - timedelta(days=age)
+        return made.issue("worker", name, tmp_path / str(next(numbers)), connect=HERE, days=2, now=when).seat
+
+    def listed():
+        return [(each.name, each.seat) for each in CertificateLedger.load(path).issued]
+
+    path = made._folder / LEDGER_FILE
+    issue("gone", age=3)
+    made.revoke("gone")
+    for name, age in (("gone", 3), ("old", 6), ("old", 3), ("new", 0), ("new", 1)):
+        issue(name, age)
+    assert listed() == [("gone", 1), ("gone", 2), ("old", 3), ("new", 4), ("new", 4)]
+    assert issue("gone") == 2
+    monkeypatch.setattr(authority, "MAX_BYTES", path.stat().st_size)
+    before = listed()
+    with pytest.raises(AccessError, match=LEDGER_FILE):
+        issue("next")
+    assert listed() == before
+    made.revoke("old")
+    assert len(list(tmp_path.iterdir())) == next(numbers)  # the folder, and a file for each that was issued
+
+
+def test_commands_at_once_wait_for_each_other(access, tmp_path):
+    with ThreadPoolExecutor(8) as pool:
+        issued = list(pool.map(lambda n: access.issue("worker", f"w{n}", tmp_path / f"{n}", connect=HERE), range(8)))
+    assert len({each.seat for each in issued}) == 8
 
 
 def test_an_existing_authority_is_not_overwritten_even_in_a_race(tmp_path, monkeypatch):
