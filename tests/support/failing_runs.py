@@ -19,14 +19,16 @@ def pause_kinds(bench):
 
 
 class Failing(Bench):
-    """A bench whose episodes fail where `fails(job)`; everything else scores by its digest."""
+    """A bench whose episodes fail where `fails(job)`; everything else scores by its digest. Other `hosts` are gone."""
 
     host_class = "0123456789abcdef"
 
-    def __init__(self, *args, fails, host_errors=(), limit=0.5, **kwargs):
+    def __init__(self, *args, fails, host_errors=(), limit=0.5, hosts=(A, B), **kwargs):
         self.fails, self.host_errors, self.failure_limit = fails, list(host_errors), limit
-        self.hosts = [A, B]
+        self.hosts = [*hosts]
         super().__init__(*args, generations=GENERATIONS, **kwargs)
+        for name in {A, B}.difference(hosts):
+            self.run.fleet.handle_departure(name, self.now)
 
     def begin(self):
         super().begin()
@@ -46,8 +48,7 @@ class Failing(Bench):
         for _ in range(turns):
             if self.run.state.ended or self.run.state.paused or stop(self.run):
                 return
-            self.now += 1.0
-            self.run.tick(self.now)
+            self.wait()
             self.run.advance(self.now)
             for name in self.hosts:
                 self.handle_heartbeat(name, host_class=self.host_class)
@@ -61,7 +62,15 @@ class Failing(Bench):
         self.journal.commit()
         with RunFolder(self.path) as folder:
             rows = [replace(each, seconds=0.0) for each in folder.history()]
-            candidates = [(each.generation, each.number, each.fitness) for each in folder.candidates()]
+            counted = folder.candidates()
+            for row in rows:
+                own = [each for each in counted if each.generation == row.number]
+                assert sum(each.steps for each in own) == row.steps
+                assert {(each.episodes, each.steps) for each in own if each.fitness is None} <= {(0, 0)}
+                most = len(folder.training_seeds(row.number))
+                episodes = {most, -(-most // 2)} if self.settings.racing else {most}
+                assert {each.episodes for each in own if each.fitness is not None} <= episodes
+            candidates = [(each.generation, each.number, each.fitness) for each in counted]
             vectors = [folder.candidate(*each[:2]).tobytes() for each in candidates]
             return rows, candidates, vectors, folder.evaluations(), folder.confirmation()
 

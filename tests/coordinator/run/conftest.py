@@ -6,17 +6,11 @@ from tests.support.failing_runs import SETTINGS, Failing
 
 
 @pytest.fixture
-def begin(tmp_path, random_bundle):
+def begin(make_bench):
     """Begins a run whose jobs fail where `fails(job)`; two hosts score it once it is served."""
-    made = []
-
-    def begin(fails=lambda job: False, settings=SETTINGS, kind=Failing, **options):
-        made.append(kind(tmp_path / str(len(made)) / "night", random_bundle.path, settings, fails=fails, **options))
-        return made[-1]
-
-    yield begin
-    for each in made:
-        each.journal.close()
+    return lambda fails=lambda job: False, settings=SETTINGS, kind=Failing, **options: make_bench(
+        kind, settings, fails=fails, **options
+    )
 
 
 @pytest.fixture

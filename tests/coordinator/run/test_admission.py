@@ -4,8 +4,6 @@ Tests common/protocol/host_classes.py."""
 from dataclasses import replace
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from dreamfleet.common.protocol.host_classes import class_from_fingerprint
 from dreamfleet.common.protocol.messages import HelloRequest, Result, ResultBatch
@@ -65,10 +63,8 @@ class Classed(Bench):
 
 
 @pytest.fixture
-def bench(tmp_path, random_bundle):
-    made = Classed(tmp_path / "night", random_bundle.path, PLAIN)
-    yield made
-    made.journal.close()
+def bench(make_bench):
+    return make_bench(Classed, PLAIN)
 
 
 def done(job):
@@ -81,15 +77,9 @@ class ByFingerprint(Classed):
     classes = {A: HERE, B: ELSEWHERE}  # noqa: RUF012
 
 
-def test_a_hello_alone_does_not_fix_the_class(bench):
-    assert bench.run.admission.host_class is None
-    bench.restart()
-    assert bench.hello(A) is bench.hello(B) is None
-
-
 @pytest.mark.parametrize("kind", [Classed, ByFingerprint])
-def test_the_first_accepted_result_fixes_the_class_and_the_other_host_is_removed(tmp_path, random_bundle, kind):
-    bench = kind(tmp_path / "night", random_bundle.path, PLAIN)
+def test_the_first_accepted_result_fixes_the_class_and_the_other_host_is_removed(make_bench, kind):
+    bench = make_bench(kind, PLAIN)
     own = kind.classes[B]
     jobs = bench.given()
     bench.deliver(B, done(jobs[B][0]))
@@ -104,7 +94,6 @@ def test_the_first_accepted_result_fixes_the_class_and_the_other_host_is_removed
     bench.restart()
     assert bench.run.admission.host_class == own
     assert bench.hello(B) is None
-    bench.journal.close()
 
 
 def test_a_worker_of_another_class_is_removed_before_it_gets_work(bench):
@@ -114,15 +103,9 @@ def test_a_worker_of_another_class_is_removed_before_it_gets_work(bench):
     assert bench.hello(A) is None, "it does not know its class yet"
     bench.find_out(A)
     assert list(bench.run.fleet.members) == [B]
-    assert "--no-strict" in bench.hello(A).remedy
-
-
-def test_a_worker_with_the_class_of_its_fingerprint_cannot_join_a_strict_run_of_another(bench):
-    jobs = bench.given()
-    bench.deliver(B, done(jobs[B][0]))
-    bench.classes = {A: HERE, B: "b" * 16}
-    bench.announced[A] = HERE
-    assert "--no-strict" in bench.hello(A).remedy
+    for each in (bench.classes[A], HERE):  # that of its fingerprint is another one too
+        bench.announced[A] = each
+        assert "--no-strict" in bench.hello(A).remedy
 
 
 def test_hosts_of_one_fingerprint_may_be_of_two_classes_and_of_two_fingerprints_of_one(bench):
@@ -142,10 +125,11 @@ def test_hosts_of_one_fingerprint_may_be_of_two_classes_and_of_two_fingerprints_
     assert (share.results, set(share.fingerprints)) == (2, {"here", "there"})
 
 
-def test_an_error_does_not_fix_the_class(bench):
+def test_neither_a_hello_nor_an_error_fixes_the_class(bench):
     jobs = bench.given()
     bench.deliver(B, Result(jobs[B][0].digest, None, 0, 0.1, failure("boom"), None))
     assert bench.run.admission.host_class is None
+    assert bench.hello(A) is bench.hello(B) is None
     bench.deliver(A, done(jobs[A][0]))
     assert bench.run.admission.host_class == "a" * 16
 
@@ -159,9 +143,8 @@ def test_a_result_of_another_life_is_judged_before_its_worker_says_hello(bench):
 
 
 @pytest.mark.parametrize("classes", [{A: "a" * 16, B: "b" * 16}, {A: HERE, B: "b" * 16}, {A: "a" * 16, B: ELSEWHERE}])
-def test_a_run_that_is_not_strict_accepts_all_classes_and_records_each_results_class(tmp_path, random_bundle, classes):
-    kind = type("Open", (Classed,), {"strict": False, "classes": classes})
-    bench = kind(tmp_path / "night", random_bundle.path, PLAIN)
+def test_a_run_that_is_not_strict_accepts_all_classes_and_records_each_results_class(make_bench, classes):
+    bench = make_bench(type("Open", (Classed,), {"strict": False, "classes": classes}), PLAIN)
     jobs = bench.given()
     for name in (A, B):
         bench.deliver(name, done(jobs[name][0]))
@@ -170,31 +153,5 @@ def test_a_run_that_is_not_strict_accepts_all_classes_and_records_each_results_c
     # If the class of the first accepted result is that of its fingerprint, so are all.
     assert bench.stored() == ({HERE, ELSEWHERE} if classes[A] == HERE else {*classes.values()})
     assert bench.run.journal.results.classes.mixed
-    bench.journal.close()
     with RunFolder(bench.path) as folder:
         assert folder.classes == bench.run.journal.results.classes
-
-
-@pytest.mark.slow
-@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    order=st.lists(
-        st.tuples(st.sampled_from(["give", "hello", "find out", "restart"]), st.sampled_from([A, B])), max_size=30
-    )
-)
-def test_in_any_order_a_strict_journal_holds_one_class(tmp_path_factory, random_bundle, order):
-    bench = Classed(tmp_path_factory.mktemp("run") / "night", random_bundle.path, PLAIN)
-    held = {A: {}, B: {}}
-    for what, name in order:
-        for who, jobs in bench.given().items():
-            held[who].update({job.digest: job for job in jobs})
-        if what == "restart":
-            bench.restart()
-        elif what == "hello":
-            bench.hello(name)
-        elif what == "find out":
-            bench.find_out(name)
-        elif held[name]:
-            bench.deliver(name, done(held[name].popitem()[1]))
-        assert len(bench.stored()) <= 1
-    bench.journal.close()

@@ -32,6 +32,7 @@ from tests.support.run_bench import SETTINGS, A, Bench
 from tests.support.samples import SPEC
 
 PLAIN = replace(SETTINGS, collect_every=0, population=4, episodes=2, evaluate_every=1, evaluation_episodes=2)
+FINE = 1.0, 10, 0.1  # fitness, steps, seconds
 EXTREME = {
     "an overflowing mean": (1.7e308, 10, 0.1), "an infinite deviation": (1e170, 10, 0.1),
     "a deviation from below": (-1e170, 10, 0.1), "steps": (1.0, MAX_COUNT, 0.1),
@@ -39,20 +40,14 @@ EXTREME = {
 
 
 @pytest.fixture
-def bench(tmp_path, random_bundle):
-    made = Bench(tmp_path / "night", random_bundle.path, PLAIN, generations=2)
-    yield made
-    made.journal.close()
+def bench(make_bench):
+    return make_bench(Bench, PLAIN, generations=2)
 
 
-def deliver_all(bench, numbers, kinds=("score", "evaluate", "collect")):
-    fitness, steps, seconds = numbers
+def deliver_all(bench, numbers=FINE, kinds=("score", "evaluate", "collect")):
     given = [(send.identity, work.job) for send in bench.run.fleet.dispatch(bench.now) for work in send.work]
     for name, job in given:
-        if job.kind in kinds:
-            bench.deliver(name, Result(job.digest, fitness, steps, seconds, None, None))
-        else:
-            bench.deliver(name, Result(job.digest, 1.0, 10, 0.1, None, None))
+        bench.deliver(name, Result(job.digest, *(numbers if job.kind in kinds else FINE), None, None))
     return given
 
 
@@ -76,15 +71,14 @@ def test_an_extreme_result_fails_its_job_with_the_reason_and_the_run_can_continu
     bench.restart()
     assert bench.run.state.paused is None
     while bench.run.state.ended is None:
-        assert deliver_all(bench, (1.0, 10, 0.1))
+        assert deliver_all(bench)
         answers_of(bench)
     assert bench.run.state.ended.kind is StopKind.GENERATIONS
 
 
 def test_generations_and_evaluations_without_finite_numbers_can_be_encoded(bench):
-    deliver_all(bench, (1.0, 10, 0.1))
     while len(bench.run.history) < 1:
-        deliver_all(bench, (1.0, 10, 0.1))
+        deliver_all(bench)
     bench.run.commit()
     with closing(sqlite3.connect(bench.path / "journal.sqlite")) as connection, connection:
         for table in ("generation", "evaluation"):
@@ -92,13 +86,12 @@ def test_generations_and_evaluations_without_finite_numbers_can_be_encoded(bench
         connection.execute("UPDATE generation SET mean = 9e999, std = NULL, best = 9e999, worst = -9e999, steps = ?",
                            (MAX_COUNT,))  # fmt: skip
         connection.execute("UPDATE evaluation SET mean = 9e999, std = NULL WHERE mean IS NOT NULL")
-    connection.close()
     bench.restart()
     bench.now += 1
-    deliver_all(bench, (1.0, 10, 0.1))
+    deliver_all(bench)
     answers_of(bench)
     while bench.run.state.ended is None:
-        assert deliver_all(bench, (1.0, 10, 0.1))
+        assert deliver_all(bench)
     bench.run.leave()
     answers_of(bench)
 
@@ -113,10 +106,10 @@ def test_huge_counts_of_slots_and_steps_can_be_encoded(bench):
 
 def test_an_error_with_too_many_steps_is_an_error(bench):
     for _ in range(3):
-        given = [(send.identity, each.job) for send in bench.run.fleet.dispatch(bench.now) for each in send.work]
-        for name, job in given[:1]:
-            bench.deliver(name, Result(job.digest, None, MAX_COUNT, 0.1, failure("boom"), None))
-            assert bench.run.fleet.jobs[job.digest].attempts[-1].error == failure("boom")
+        send = next(each for each in bench.run.fleet.dispatch(bench.now) if each.work)
+        digest = send.work[0].digest
+        bench.deliver(send.identity, Result(digest, None, MAX_COUNT, 0.1, failure("boom"), None))
+        assert bench.run.fleet.jobs[digest].attempts[-1].error == failure("boom")
         answers_of(bench)
     assert bench.run.fleet.counts["errors"] == 3
 

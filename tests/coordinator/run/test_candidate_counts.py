@@ -1,13 +1,7 @@
-"""Each candidate's episodes and steps in a run's tables, against what its generations and its search say.
-
-The runs are real journals: candidates fail, are drawn anew, get other seeds, race, and are scored again after recalls.
-
-Tests common/runs/journal/candidate_counts.py.
-"""
+"""Each candidate's episodes and steps in a run's tables; `Failing.story` compares them with their generations.
+Tests common/runs/journal/candidate_counts.py."""
 
 import csv
-import random
-from collections import Counter, defaultdict
 from dataclasses import replace
 
 import pytest
@@ -18,103 +12,23 @@ from dreamfleet.coordinator.addons.runs.stored_run import StoredRun
 from dreamfleet.coordinator.run.recall import recall
 from dreamfleet.coordinator.storage.verification_records import StoredBar
 from tests.support import batch_door
-from tests.support.failing_runs import SETTINGS
-
-SEEDS = range(6)
+from tests.support.failing_runs import SETTINGS, by_vector
 
 
-def check(path):
-    """Compare the candidates with their generations; counts of what happened."""
-    with RunFolder(path) as run:
-        history, candidates = {each.number: each for each in run.history()}, run.candidates()
-        episodes = {number: len(run.training_seeds(number)) for number in history}
-        racing = run.settings.racing
-        story = Counter(
-            redrawn=run._journal.row("SELECT count(*) FROM redraw")[0], reseeds=run.count_reseeds(history.values())
-        )
-        surplus = run._journal.row("SELECT count(*) FROM result WHERE kind = 'score'")[0]
-    found = defaultdict(list)
-    for each in candidates:
-        found[each.generation].append(each)
-        surplus -= each.episodes
-    for number, closed in history.items():
-        own = found[number]
-        assert sum(each.steps for each in own) == closed.steps
-        scored = [each for each in own if each.fitness is not None]
-        counts = Counter(each.episodes for each in scored)
-        if racing:
-            assert counts.keys() <= {episodes[number], -(-episodes[number] // 2)}
-            assert episodes[number] == 1 or counts[episodes[number]] <= -(-len(own) // 2)
-        else:
-            assert counts.keys() <= {episodes[number]}
-        assert {(each.episodes, each.steps, each.seconds) for each in own if each.fitness is None} <= {(0, 0, 0.0)}
-        assert sum(each.fitness for each in scored) / max(len(scored), 1) == pytest.approx(closed.mean)
-    return story + Counter(surplus=surplus, generations=len(history))
-
-
-def drawn(seed):
-    """A run's settings, and which of its episodes fail."""
-    chance = random.Random(seed)
-    settings = replace(
-        SETTINGS, episodes=chance.randint(1, 4), racing=chance.random() < 0.5, population=chance.randint(4, 8),
-        on_failure=chance.choice(["worst", "redraw", "redraw"]),
-    )  # fmt: skip
-    bad_seeds, bad_jobs = chance.choice([0.0, 0.2]), chance.choice([0.04, 0.12])
-
-    def fails(job):
-        if job.kind != "score":
-            return False
-        return random.Random(job.seeds[0]).random() < bad_seeds or job.digest[0] < 256 * bad_jobs
-
-    return settings, fails, chance
-
-
-@pytest.fixture(scope="module")
-def stories():
-    found = Counter()
-    yield found
-    if found["runs"] == len(SEEDS):
-        assert min(found[each] for each in ("redrawn", "reseeds", "surplus", "recalls")) > 0, found
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_sums_over_candidates_are_their_generations(begin, stories, seed):
-    settings, fails, chance = drawn(seed)
-    bench = begin(fails, settings, limit=1.0)
-    recalls = 0
-    for _ in range(50):
-        until = chance.randint(3, 60)
-        bench.serve(stop=lambda run, until=until: run.fleet.counts["accepted"] > until)
-        check(bench.path)
-        if (bench.run.state.ended and recalls == 2) or bench.run.state.paused:
-            break
-        if recalls < 2 and chance.random() < 0.4:
-            recalls += 1
-            recall(bench.journal, settings, {"ab"[recalls - 1]})
-            bench.journal.commit()
-        bench.restart()
-    bench.journal.commit()
-    stories.update(check(bench.path), recalls=recalls, runs=1)
-
-
-def test_every_table_has_the_same_candidates(begin, tmp_path):
-    settings, fails, _ = drawn(1)
-    bench = begin(fails, settings, limit=1.0)
-    bench.serve()
-    bench.journal.close()
+def test_every_table_has_the_same_candidates(failing, tmp_path):
+    settings = replace(SETTINGS, racing=True, episodes=4, on_failure="redraw")
+    bench = failing(fails=by_vector(0.15), limit=1.0, settings=settings)
     with StoredRun(bench.path) as run:
-        expected = rows_of(run, "candidates")
-        assert run.to_pandas("candidates").steps.sum() == sum(each["steps"] for each in expected)
-        assert run.to_polars("candidates")["episodes"].to_list() == [each["episodes"] for each in expected]
+        rows = [(each["episodes"], each["steps"]) for each in rows_of(run, "candidates")]
+        pandas, polars = run.to_pandas("candidates"), run.to_polars("candidates")
         export_csv(run, tmp_path)
         export_parquet(run, tmp_path)
+    assert list(zip(pandas.episodes, pandas.steps, strict=True)) == rows
+    assert polars.select("episodes", "steps").rows() == rows
     with (tmp_path / "candidates.csv").open() as file:
-        assert [int(row["episodes"]) for row in csv.DictReader(file)] == [each["episodes"] for each in expected]
-    parquet = pytest.importorskip("pyarrow.parquet")
-    assert parquet.read_table(tmp_path / "candidates.parquet")["steps"].to_pylist() == [
-        each["steps"] for each in expected
-    ]
+        assert [(int(row["episodes"]), int(row["steps"])) for row in csv.DictReader(file)] == rows
+    stored = pytest.importorskip("pyarrow.parquet").read_table(tmp_path / "candidates.parquet").to_pylist()
+    assert [(each["episodes"], each["steps"]) for each in stored] == rows
 
 
 def test_batches_of_others_share_results_and_keep_them_after_a_recall(tmp_path):

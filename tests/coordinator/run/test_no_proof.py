@@ -39,8 +39,7 @@ def left(begin):
         bench.handle_heartbeat(life, host_class=bench.host_class)
         assert len(bench.run.fleet.dispatch(bench.now)[0].work) == 2
         bench.run.fleet.handle_departure(life, bench.now)
-        bench.now += 1.0
-        bench.run.tick(bench.now)
+        bench.wait()
         bench.run.advance(bench.now)
     assert all(each.is_suspect for each in bench.run.fleet.jobs.values())
     bench.hosts = [NEW]

@@ -28,21 +28,31 @@ from tests.support.run_bench import A, B, Bench, result_of
 OPTIMISERS = ["cma", "full", "cmaes-lra", "openes", "pepg", "snes", "xnes"]
 
 
+CMA = replace(SETTINGS, evaluate_every=1, evaluation_episodes=2)
+
+
 def settings_of(optimiser):
-    named = {"covariance": "full"} if optimiser == "full" else {"optimiser": optimiser}
-    return replace(SETTINGS, evaluate_every=1, evaluation_episodes=2, **named)
+    return replace(CMA, **({"covariance": "full"} if optimiser == "full" else {"optimiser": optimiser}))
 
 
 @pytest.fixture
 def ended(failing):
     """Begins a run and serves it to its end."""
 
-    def build(settings=None, **options):
-        bench = failing(settings=settings or settings_of("cma"), **options)
+    def build(settings=CMA, **options):
+        bench = failing(settings=settings, **options)
         assert bench.run.state.ended
         return bench
 
     return build
+
+
+def live_on(bench):
+    """A further life of the coordinator, to its end."""
+    bench.journal.commit()
+    bench.restart()
+    bench.serve()
+    assert bench.run.state.ended
 
 
 def outcome(bench):
@@ -92,13 +102,11 @@ def test_a_race_from_which_lies_are_recalled_is_one_without_them(ended, begin, s
     honest = ended(settings)
     bench = begin(None, settings, Lying)
     bench.serve()
-    bar(bench, "a", [B])
-    assert bench.story() == honest.story()
-    assert sums(bench) == sums(honest)
-    assert all(made == counted == scored for made, counted, scored in sums(bench))
-    bar(bench, "b", ["c/1"])  # what a race did not want may be wanted again
-    assert bench.story() == honest.story()
-    assert sums(bench) == sums(honest)
+    for host, others in (("a", [B]), ("b", ["c/1"])):  # what a race did not want may be wanted again
+        bar(bench, host, others)
+        assert bench.story() == honest.story()
+        assert sums(bench) == sums(honest)
+        assert all(made == counted == scored for made, counted, scored in sums(bench))
 
 
 class Broken(Failing):
@@ -162,29 +170,21 @@ def test_a_replayed_strategy_asks_for_what_the_stored_one_asks_for(ended, optimi
         np.testing.assert_array_equal(*asked)
 
 
-@pytest.mark.parametrize("optimiser", OPTIMISERS)
-def test_a_run_of_which_all_is_recalled_comes_to_the_same(ended, optimiser):
-    bench = ended(settings_of(optimiser))
+def test_a_run_of_which_all_is_recalled_comes_to_the_same(ended):
+    bench = ended()
     before = outcome(bench)
     recall(bench.journal, bench.settings, {"a"})
     assert bench.journal.last_generation().number == 0
-    bench.journal.commit()
-    bench.restart()
-    assert bench.run.generation.number < GENERATIONS
-    bench.serve()
-    assert bench.run.state.ended
+    live_on(bench)
     assert outcome(bench) == before
 
 
 def test_candidates_that_were_drawn_anew_are_drawn_anew_again(ended):
-    settings = replace(settings_of("cma"), on_failure="redraw")
-    bench = ended(settings, fails=lambda job: job.kind == "score" and job.digest[0] % 8 == 0)
+    fails = lambda job: job.kind == "score" and job.digest[0] % 8 == 0  # noqa: E731
+    bench = ended(replace(CMA, on_failure="redraw"), fails=fails)
     before = outcome(bench)
     recall(bench.journal, bench.settings, {"b"})
-    bench.journal.commit()
-    bench.restart()
-    bench.serve()
-    assert bench.run.state.ended
+    live_on(bench)
     assert outcome(bench) == before
 
 
@@ -192,13 +192,10 @@ def test_what_other_hosts_scored_in_dropped_generations_is_not_scored_again(ende
     bench = ended()
     mine = {digest for (digest,) in bench.journal.read("SELECT digest FROM result WHERE worker LIKE 'b/%'")}
     recall(bench.journal, bench.settings, {"a"})
-    bench.journal.commit()
     aside = {digest for (digest,) in bench.journal.read("SELECT digest FROM recalled WHERE because = 'rewound'")}
     assert aside
     assert aside <= mine
-    bench.restart()
-    bench.serve()
-    assert bench.run.state.ended
+    live_on(bench)
     again = "SELECT digest FROM result WHERE worker LIKE 'b/%' AND incarnation = 1"
     assert {digest for (digest,) in bench.journal.read(again)} == mine
 
@@ -208,11 +205,8 @@ def test_what_a_host_brought_to_dropped_generations_counts_no_more_once_it_is_ba
     before = outcome(bench)
     for host in ("a", "b"):
         recall(bench.journal, bench.settings, {host})
-    bench.journal.commit()
     assert set(bench.journal.read("SELECT because FROM recalled")) == {("barred",)}
-    bench.restart()
-    bench.serve()
-    assert bench.run.state.ended
+    live_on(bench)
     assert not bench.journal.read("SELECT 1 FROM result WHERE incarnation = 1")
     assert outcome(bench) == before
 
@@ -224,26 +218,27 @@ def test_a_journal_of_another_host_is_not_rewound(ended):
         new_generations(bench).replay(2)
 
 
-def test_files_of_recalled_rollouts_are_removed_and_those_that_are_collected_again_stay(tmp_path, random_bundle):
-    bench = Bench(tmp_path / "run", random_bundle.path)
+def collect(bench):
+    """Keep all rollouts of a run; their files."""
+    for name, job in bench.reach_collection():
+        for part in bench.parts(job):
+            bench.upload(name, part)
+        bench.deliver(name, result_of(job))
+    assert bench.run.state.ended
+    with RunFolder(bench.path) as run:
+        return run.rollouts()
 
-    def collect():
-        for name, job in bench.reach_collection():
-            for part in bench.parts(job):
-                bench.upload(name, part)
-            bench.deliver(name, result_of(job))
-        assert bench.run.state.ended
-        with RunFolder(bench.path) as run:
-            return run.rollouts()
 
-    files = collect()
+def test_files_of_recalled_rollouts_are_removed_and_those_that_are_collected_again_stay(make_bench):
+    bench = make_bench(Bench)
+    files = collect(bench)
     whole = [path.read_bytes() for path in files]
     recall(bench.journal, bench.settings, {"a"})
     bench.journal.commit()
     assert all(path.exists() for path in files)
     bench.restart()
     assert not any(path.exists() for path in files)
-    assert collect() == files
+    assert collect(bench) == files
     assert [path.read_bytes() for path in files] == whole
     bench.restart()
     assert all(path.exists() for path in files)
@@ -275,14 +270,6 @@ def test_a_host_is_barred_from_a_run_that_has_ended_and_comes_again(ended):
         assert (run.checks.barred, run.checks.by_operator) == ((), ())
 
 
-def test_of_an_external_run_complete_batches_stay_and_what_the_host_brought_is_known_no_more(tmp_path, random_bundle):
-    settings = replace(SETTINGS, optimiser="external", evaluate_every=0)
-    journal = Journal.create(tmp_path, settings, random_bundle.path)
-    journal.begin_incarnation()
-    recall(journal, settings, {"a"})
-    journal.close()
-
-
 def test_a_reported_controller_is_withdrawn_before_its_recall_is_durable_and_a_life_writes_it_again(ended, monkeypatch):
     bench = ended()
     path = bench.path / CONTROLLER
@@ -312,7 +299,7 @@ def test_a_reported_controller_is_withdrawn_before_its_recall_is_durable_and_a_l
 
 
 def test_a_life_without_a_closed_generation_has_no_reported_controller(begin):
-    bench = begin(None, settings_of("cma"))
+    bench = begin(None, CMA)
     (bench.path / CONTROLLER).write_bytes(b"of what was recalled")
     bench.restart()
     assert not (bench.path / CONTROLLER).exists()
@@ -356,7 +343,7 @@ def test_a_bar_that_is_refused_changes_nothing(ended, monkeypatch, refusal):
 
 
 def test_a_bar_on_a_full_disk_is_refused_and_changes_nothing(begin, monkeypatch):
-    bench = begin(settings=settings_of("cma"))
+    bench = begin(settings=CMA)
     bench.serve(stop=lambda run: len(run.history) == 2)
     bench.run.commit()
     with RunFolder(bench.path) as run:
@@ -371,8 +358,7 @@ def test_a_bar_on_a_full_disk_is_refused_and_changes_nothing(begin, monkeypatch)
         assert bench.run.state.stalled is not None
         assert not bench.run.commit()
         assert bench.run.bar("a"), "it is not asked again while the disk is full"
-    bench.now += 10.0
-    bench.run.tick(bench.now)
+    bench.wait(10.0)
     assert bench.run.commit()
     with RunFolder(bench.path) as run:
         assert run.checks is None
@@ -384,15 +370,10 @@ def test_a_bar_on_a_full_disk_is_refused_and_changes_nothing(begin, monkeypatch)
     assert [*bench.run.admission.barred] == ["a"]
 
 
-def test_rollouts_of_a_barred_host_are_removed_though_nobody_serves_the_run(tmp_path, random_bundle):
-    bench = Bench(tmp_path / "run", random_bundle.path)
-    for name, job in bench.reach_collection():
-        for part in bench.parts(job):
-            bench.upload(name, part)
-        bench.deliver(name, result_of(job))
+def test_rollouts_of_a_barred_host_are_removed_though_nobody_serves_the_run(make_bench):
+    bench = make_bench(Bench)
+    files = collect(bench)
     bench.journal.close()
-    with RunFolder(bench.path) as run:
-        files = run.rollouts()
     assert all(path.exists() for path in files)
     bar_stored(bench.path, "a", is_barred=True)
     assert not any(path.exists() for path in files)

@@ -17,29 +17,15 @@ from tests.support.reporting_runs import EVALUATED, Reporting
 
 
 @pytest.fixture
-def make(tmp_path, random_bundle):
-    made = []
-
-    def begin(settings=EVALUATED, generations=100):
-        made.append(Reporting(tmp_path / "runs" / f"night-{len(made)}", random_bundle.path, settings, generations))
-        return made[-1]
-
-    yield begin
-    for each in made:
-        each.journal.close()
+def make(make_bench):
+    return lambda settings=EVALUATED, generations=100: make_bench(Reporting, settings, generations)
 
 
-def test_a_controller_is_there_from_the_first_closed_generation_on(make):
+def test_a_mean_without_evaluation_is_saved_at_once_at_intervals_and_as_the_coordinator_leaves(make):
     bench = make(replace(EVALUATED, evaluate_every=0))
     assert bench.saved() is None
-    bench.close(1)
-    assert bench.saved().provenance["generation"] == 0
-
-
-def test_a_mean_without_evaluation_is_saved_at_intervals_and_as_the_coordinator_leaves(make):
-    bench = make(replace(EVALUATED, evaluate_every=0))
     bench.close(3)
-    assert bench.saved().provenance["generation"] == 0
+    assert bench.saved().provenance["generation"] == 0, "that of the first closed one"
     bench.now += SAVE_INTERVAL
     bench.close(4)
     assert bench.saved().provenance["generation"] == 3

@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import msgspec
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from dreamfleet.common.protocol.messages import Result, ResultBatch
 from dreamfleet.common.protocol.stop_kind import PauseKind, StopKind
@@ -19,14 +17,8 @@ from tests.support.run_bench import DRIVES, SETTINGS, A, B, Bench, drive_of, res
 
 
 @pytest.fixture
-def bench(tmp_path, random_bundle):
-    made = Bench(tmp_path / "night", random_bundle.path)
-    yield made
-    made.journal.close()
-
-
-def test_a_run_that_checks_nothing_says_nothing_of_checks(bench):
-    assert bench.run.verification.summary is None
+def bench(make_bench):
+    return make_bench(Bench)
 
 
 def test_a_kill_between_dispatch_and_commit_loses_nothing(bench):
@@ -110,114 +102,38 @@ def test_a_restart_during_an_upload_repeats_it_and_keeps_finished_rollouts(bench
     assert bench.kept() == [drive_of(job), drive_of(other)]
 
 
-def fail(bench, name, digest, error):
-    bench.deliver(name, Result(digest, None, 0, 0.1, failure(error), None))
-
-
 def test_a_pause_names_candidate_seed_every_worker_how_often_and_why(bench):
     given = {send.identity: send.work for send in bench.run.fleet.dispatch(bench.now)}
     work = given[A][0]
     seed, name = work.job.seeds[0], f"candidate 0/{work.job.candidate}"
-    fail(bench, A, work.job.digest, "boom")
-    assert bench.run.state.paused is None
-    bench.run.fleet.dispatch(bench.now)
-    fail(bench, B, work.job.digest, "bang")
+    for worker, error in ((A, "boom"), (B, "bang")):
+        assert bench.run.state.paused is None
+        bench.run.fleet.dispatch(bench.now)
+        bench.deliver(worker, Result(work.job.digest, None, 0, 0.1, failure(error), None))
     (pause,) = bench.run.state.paused.pauses
     assert pause.kind is PauseKind.FAILED_JOB
     assert all(each in pause.text for each in (name, str(seed), A, B, "boom", "bang", "dreamfleet resume"))
     assert any(each.what == "paused" for each in bench.run.take_notes())
 
 
-def test_a_pause_on_the_only_worker_names_one_worker_and_three_failures(bench):
-    bench.run.fleet.handle_departure(B, bench.now)
-    bench.now += 1
-    bench.run.tick(bench.now)
-    digest = None
-    while bench.run.state.paused is None:
-        bench.now += 1
-        bench.run.tick(bench.now)
-        bench.handle_heartbeat(A)
-        for send in bench.run.fleet.dispatch(bench.now):
-            digest = digest or (send.work[0].job.digest if send.work else None)
-        fail(bench, A, digest, "boom")
-    (failure,) = bench.run.fleet.jobs.failures
-    assert (bench.run.state.paused.pauses[0].kind, failure.attempts_by_worker) == (PauseKind.FAILED_JOB, {A: 3})
-
-
-STEPS = st.one_of(
-    st.tuples(st.just("part"), st.sampled_from([A, B]), st.integers(0, DRIVES - 1), st.integers(0, 2)),
-    st.tuples(st.just("spoilt"), st.sampled_from([A, B]), st.integers(0, DRIVES - 1), st.integers(0, 2)),
-    st.tuples(st.just("result"), st.sampled_from([A, B]), st.integers(0, DRIVES - 1)),
-    st.tuples(st.just("adopt"), st.sampled_from([A, B]), st.integers(0, DRIVES - 1)),
-    st.tuples(st.just("wait"), st.floats(0.1, 90.0)),
-    st.tuples(st.just("restart")),
-)
-
-
 @pytest.mark.slow
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(steps=st.lists(STEPS, max_size=40))
-def test_under_loss_duplication_late_parts_and_restarts_each_rollout_is_kept_whole_once(
-    tmp_path_factory, random_bundle, steps
-):
-    bench = Bench(tmp_path_factory.mktemp("run") / "night", random_bundle.path)
-    given = bench.reach_collection()
-    jobs = [job for _, job in given]
-    accepted = []
-    for kind, *what in steps:
-        if kind in ("part", "spoilt"):
-            part = bench.parts(jobs[what[1]])[what[2]]
-            bench.upload(what[0], part if kind == "part" else msgspec.structs.replace(part, data=bytes(len(part.data))))
-        elif kind == "result":
-            bench.deliver(what[0], result_of(jobs[what[1]]))
-        elif kind == "adopt":
-            bench.handle_heartbeat(what[0], unacked=[jobs[what[1]].digest])
-        elif kind == "wait":
-            bench.now += what[0]
-            bench.run.tick(bench.now)
-            bench.run.advance(bench.now)
-            bench.run.commit()
-        elif kind == "restart" and bench.run.state.ended is None:
-            bench.restart()
-        accepted += [digest for _, digest, verdict in bench.verdicts() if verdict == "accepted"]
-        whole = {drive_of(job) for job in jobs}
-        assert set(bench.kept()) <= whole, "a counted rollout is whole"
-        assert len(bench.kept()) == bench.run.background_jobs.rollout_collections.progress[0]
-    for name, job in given:  # two undisturbed rounds: a spoilt part ends the first
-        for _ in range(2):
-            bench.handle_heartbeat(name, unacked=[job.digest])
-            for part in bench.parts(job):
-                bench.upload(name, part)
-            bench.deliver(name, result_of(job))
-        accepted += [digest for _, digest, verdict in bench.verdicts() if verdict == "accepted"]
-    assert bench.kept() == [drive_of(job) for job in jobs]
-    assert len(accepted) == len(set(accepted))
-    assert bench.run.state.ended is not None
-    bench.journal.close()
-
-
-@pytest.mark.slow
-def test_a_run_whose_population_is_one_point_ends_with_that_reason(tmp_path, random_bundle):
+def test_a_run_whose_population_is_one_point_ends_with_that_reason(make_bench):
     """With equal fitness the step size falls until the population is one point; later it would underflow."""
     settings = replace(SETTINGS, population=4, collect_every=0, sigma0=1e-30)
-    bench = Bench(tmp_path / "night", random_bundle.path, settings, generations=0)
-    for _ in range(2):
-        while bench.run.state.ended is None:
-            bench.score()
-        assert bench.run.state.ended.kind is StopKind.ONE_POINT
-        closed = len(bench.run.history)
-        bench.restart()
-        assert len(bench.run.history) == closed
-        assert bench.run.state.ended
-        assert bench.run.state.ended.kind is StopKind.ONE_POINT
+    bench = make_bench(Bench, settings, generations=0)
+    while bench.run.state.ended is None:
+        bench.score()
+    closed = len(bench.run.history)
+    bench.restart()
+    assert (bench.run.state.ended.kind, len(bench.run.history)) == (StopKind.ONE_POINT, closed)
     with RunFolder(bench.path) as stored:
         assert stored.stop_kind is StopKind.ONE_POINT
 
 
-def test_parted_compares_the_same_scores_before_and_after_a_restart(tmp_path, random_bundle):
+def test_parted_compares_the_same_scores_before_and_after_a_restart(make_bench):
     """R28: it reads them from the journal. Equal means share their results, whichever generation asked for them."""
     settings = replace(SETTINGS, collect_every=0, evaluate_every=1, evaluation_episodes=4)
-    bench = Bench(tmp_path / "night", random_bundle.path, settings, generations=3)
+    bench = make_bench(Bench, settings, generations=3)
     while bench.run.state.ended is None:
         bench.score(lambda job: job.digest[0] / 10)
 
@@ -236,10 +152,10 @@ def test_parted_compares_the_same_scores_before_and_after_a_restart(tmp_path, ra
         assert [run.scores(each.generation) for each in run.evaluations()] == [*before, before[1]]
 
 
-def test_a_reached_limit_stays_reached_when_the_last_evaluation_contradicts_it(tmp_path, random_bundle):
+def test_a_reached_limit_stays_reached_when_the_last_evaluation_contradicts_it(make_bench):
     """`--parted` reads the latest evaluations: the last one, which the end itself schedules, may be better again."""
     settings = replace(SETTINGS, collect_every=0, evaluate_every=1, evaluation_episodes=4, confirm_episodes=8)
-    bench = Bench(tmp_path / "night", random_bundle.path, settings, generations=0)
+    bench = make_bench(Bench, settings, generations=0)
     bench.limits = LimitsConfig(parted=1)
     bench.restart()
     level = {0: 9.0, 1: 1.0}

@@ -3,6 +3,7 @@ Tests common/protocol/stop_kind.py."""
 
 import re
 from dataclasses import replace
+from math import inf, nan
 from types import SimpleNamespace
 
 import pytest
@@ -51,18 +52,14 @@ def test_each_end_has_its_kind(kind, limits):
     found = find(LimitsConfig(**limits), 2, 1, 1, 1, jobs=FALLEN, generation=generation)
     assert found.kind is kind
     assert StopKind.parse(found.kind.value) is kind
-    assert "--" not in found.text, "a search in Python says it too"
-
-
-def test_a_kind_that_is_not_known_is_none():
-    assert StopKind.parse(None) is None
     assert StopKind.parse("of a later version") is None
+    assert "--" not in found.text, "a search in Python says it too"
 
 
 def test_a_run_ends_when_a_candidate_reaches_the_target():
     assert reason(LimitsConfig(candidate_target=3.0), 1, 2.9) is None
-    assert reason(LimitsConfig(candidate_target=3.0), 1, 3, 2) == "a candidate reached 3.0"
-    assert reason(LimitsConfig(candidate_target=0.0), -1e-13, 0.0) == "a candidate reached 0.0"
+    assert "3.0" in reason(LimitsConfig(candidate_target=3.0), 1, 3, 2)
+    assert reason(LimitsConfig(candidate_target=0.0), -1e-13, 0.0)
 
 
 def test_a_run_ends_after_so_many_generations_without_a_better_candidate():
@@ -79,19 +76,16 @@ def test_a_run_ends_after_so_many_generations_without_a_better_candidate():
     assert reason(limits, *small, spread=2e-14) is None, "of a function whose values differ by less than 1"
 
 
-def test_a_functions_steps_are_its_evaluations():
-    assert reason(LimitsConfig(steps=20), 1, 2) == "20 environment steps"
-    assert reason(LimitsConfig(steps=20), 1, 2, task="function:mine:cost") == "20 evaluations"
-
-
-def test_a_minimised_functions_target_is_told_as_its_value():
+def test_of_a_function_evaluations_are_counted_and_a_minimised_target_is_named_by_its_value():
     options = Objective.of({"x0": [0.0], "minimise": True}).options
-    assert reason(LimitsConfig(candidate_target=-0.5), -2, -0.25, task="function:mine:cost", options=options) == (
-        "a candidate reached 0.25"
-    )
+    task = {"task": "function:mine:cost", "options": options}
+    assert reason(LimitsConfig(steps=20), 1, 2) != reason(LimitsConfig(steps=20), 1, 2, **task)
+    assert re.search(r"\b0\.25", reason(LimitsConfig(candidate_target=-0.5), -2, -0.25, **task))
 
 
-@pytest.mark.parametrize("wrong", [{"stagnation": -1}, {"candidate_target": float("nan")}])
-def test_what_is_no_limit_is_refused(wrong):
-    with pytest.raises(UsageError):
-        LimitsConfig(**wrong)
+@pytest.mark.parametrize(
+    ("flag", "wrong"), [("stagnation", -1), ("candidate-target", nan), ("target", nan), ("target", inf)]
+)
+def test_what_is_no_limit_is_refused(flag, wrong):
+    with pytest.raises(UsageError, match=f"--{flag}"):
+        LimitsConfig(**{flag.replace("-", "_"): wrong})

@@ -27,8 +27,7 @@ def test_comings_failures_pauses_and_lives_are_kept_in_order(bench):
     bench.restart()
     bench.serve()
     bench.run.fleet.handle_departure(A, bench.now)
-    bench.now += 1
-    bench.run.tick(bench.now)
+    bench.wait()
     found = texts(bench)
     expected = [(1, "incarnation 1"), (1, A), (1, BY_HAND.text), (2, "incarnation 2"), (2, "0/1"),
                 (2, "3 generations")]  # fmt: skip

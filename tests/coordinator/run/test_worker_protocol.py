@@ -6,21 +6,18 @@ from dreamfleet.common.errors import InternalError
 from dreamfleet.common.protocol.messages import Result, ResultBatch
 from dreamfleet.common.schema.validation import MAX_TEXT
 from dreamfleet.coordinator.dispatch.refusals import Refusal
-from tests.support.run_bench import SETTINGS, B, Bench
+from tests.support.run_bench import B, Bench
 
 
 @pytest.fixture
-def bench(tmp_path, random_bundle):
-    made = Bench(tmp_path / "run", random_bundle.path, SETTINGS)
-    yield made
-    made.journal.close()
+def bench(make_bench):
+    return make_bench(Bench)
 
 
 def given_jobs(bench):
     """Jobs, all given to one worker."""
     bench.run.fleet.handle_departure(B, bench.now)
-    bench.now += 1
-    bench.run.tick(bench.now)
+    bench.wait()
     return [(send.identity, work.job) for send in bench.run.fleet.dispatch(bench.now) for work in send.work]
 
 
@@ -55,10 +52,7 @@ def test_an_exception_before_a_result_counts_loses_no_other_result(bench, monkey
 def test_an_exception_while_a_result_is_counted_ends_the_incarnation_and_the_next_one_loses_nothing(bench, monkeypatch):
     (worker, first), (_, second) = given_jobs(bench)
 
-    def stumble(*_):
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(bench.run.generation, "record", stumble)
+    monkeypatch.setattr(bench.run.generation, "record", lambda *_: 1 / 0)
     with pytest.raises(InternalError, match=r"ZeroDivisionError.*--resume"):
         send(bench, worker, scored(first))
     bench.restart()

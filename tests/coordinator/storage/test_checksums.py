@@ -7,14 +7,13 @@ from dataclasses import replace
 
 import pytest
 
-from dreamfleet.common.errors import DamagedJournalError, JournalError
+from dreamfleet.common.errors import DamagedJournalError
 from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.coordinator.settings.fork import Fork
 from dreamfleet.coordinator.settings.start import find_start
 from dreamfleet.coordinator.storage import recall_records
-from dreamfleet.coordinator.storage.journal import Journal
 from tests.support.batch_door import Door
 from tests.support.failing_runs import SETTINGS, Failing
 
@@ -33,9 +32,9 @@ class Scoring(Failing):
 
 
 @pytest.fixture
-def ended(tmp_path, random_bundle):
+def ended(make_bench):
     """The folder of a run that ended."""
-    return end(Failing(tmp_path / "night", random_bundle.path, ENDING, fails=lambda _: False))
+    return end(make_bench(Failing, ENDING, fails=lambda _: False))
 
 
 def end(bench):
@@ -82,17 +81,6 @@ def test_rows_that_are_lost_added_or_exchanged_are_damage(ended, statements):
         verify(ended)
 
 
-@pytest.mark.parametrize("version", [-5, 0, 2, 8, 9])
-def test_a_journal_that_is_not_of_its_version_is_damaged_and_not_migrated(ended, version):
-    edit(ended, f"PRAGMA user_version = {version}")
-    whole = (ended / JOURNAL).read_bytes()
-    with pytest.raises(JournalError):
-        RunFolder(ended)
-    with pytest.raises(JournalError):
-        Journal(ended / JOURNAL)
-    assert (ended / JOURNAL).read_bytes() == whole
-
-
 @pytest.mark.parametrize("begin", [lambda folder: Fork.of(folder.parent, folder.name, ()),
                                    lambda folder: find_start(folder.name, folder.parent)])  # fmt: skip
 def test_no_run_begins_at_a_damaged_one(ended, begin):
@@ -103,8 +91,8 @@ def test_no_run_begins_at_a_damaged_one(ended, begin):
 
 
 @pytest.mark.parametrize("largest", [1.0, 1e9, 1e90])
-def test_large_scores_that_cancel_out_are_no_damage(tmp_path, random_bundle, largest):
-    bench = Scoring(tmp_path / "night", random_bundle.path, ENDING, fails=lambda _: False)
+def test_large_scores_that_cancel_out_are_no_damage(make_bench, largest):
+    bench = make_bench(Scoring, ENDING, fails=lambda _: False)
     bench.largest = largest
     end(bench)
 
@@ -114,9 +102,8 @@ def door(tmp_path):
     made = Door(tmp_path / "search")
     for name, first in (("a", 0.0), ("b", 500.0)):
         made.submit(name, first=first)
-    made.step()
-    made.work()
-    made.work()
+        made.step()
+        made.work()
     assert made.query("read", id="b").state == "complete"
     return made
 
@@ -130,14 +117,15 @@ def test_batches_that_exchange_their_scores_are_damage(door):
 
 
 def test_a_clock_that_is_set_back_before_a_bar_is_no_damage(door, monkeypatch):
-    with RunFolder(door.path) as run:
-        before = run.candidates()
+    before = scored(door.path)
     monkeypatch.setattr(recall_records, "time", lambda: 0.0)
     assert not door.run.bar("a")
     assert door.run.commit()
     door.journal.close()
     verify(door.path)
-    with RunFolder(door.path) as run:
-        assert [each for each in run.candidates() if each.fitness is not None] == [
-            each for each in before if each.fitness is not None
-        ]
+    assert scored(door.path) == before
+
+
+def scored(folder):
+    with RunFolder(folder) as run:
+        return [each for each in run.candidates() if each.fitness is not None]

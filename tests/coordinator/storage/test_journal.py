@@ -5,6 +5,7 @@ import os
 import shutil
 import sqlite3
 from contextlib import closing
+from functools import partial
 
 import numpy as np
 import pytest
@@ -68,18 +69,6 @@ def test_a_candidate_that_was_drawn_anew_and_does_not_exist_is_damage(journal, f
         journal.last_generation()
 
 
-def test_it_gives_back_what_was_written(journal, folder):
-    fill(journal)
-    last = journal.last_generation()
-    assert (last.number, last.state, last.seeds, last.vectors) == (1, b"state 1", (8,), tuple(VECTORS))
-    with RunFolder(folder) as run:
-        assert run.settings == SETTINGS
-        assert np.array_equal(run.candidate(0, 1), np.full(6, 1.5, np.float32))
-        assert [run.fitness(0, 0), run.fitness(0, 1), run.fitness(1, 0)] == [0.0, 1.0, None]
-        assert [(each.seed, each.fitness) for each in run.results(0, 1)] == [(7, 1.0)]
-        assert [each.number for each in run.history()] == [0]
-
-
 def test_jobs_of_any_generation_are_found_by_an_index(journal, monkeypatch):
     journal.results.index_scores()
     plans, read = [], journal.read
@@ -119,30 +108,12 @@ def test_a_check_stands_again_with_its_result_though_another_generation_asked_fo
     assert journal.verification.unverified([again]) == {}
 
 
-def test_what_was_not_committed_never_happened(folder):
-    journal = Journal(folder / "journal.sqlite")
-    fill(journal)
-    journal.set_fact("fingerprint", "f")
-    journal.close()
-    with RunFolder(folder) as run:
-        assert run.fingerprint is None
-        assert len(run.history()) == 1
-
-
 def test_only_the_last_two_states_stay(journal):
     for number in range(5):
         journal.open_generation(number, b"s", 0.1, [number], VECTORS)
     journal.commit()
     count = journal._connection.execute("SELECT count(*) FROM strategy").fetchone()[0]
     assert count == 2
-
-
-def test_evaluations_are_kept_until_finished(journal):
-    journal.schedule_evaluation(Evaluation(4, VECTORS[0], 2))
-    assert journal.pending_evaluations() == [Evaluation(4, VECTORS[0], 2)]
-    journal.finish_evaluation(4, StoredEvaluation(4, 2, 800.0, 10.0), 0)
-    assert journal.pending_evaluations() == []
-    assert journal.evaluated_vector(4) == VECTORS[0]
 
 
 def test_finalists_are_the_best_means_each_once(journal):
@@ -159,27 +130,25 @@ def test_a_run_is_never_overwritten(folder, random_bundle):
         Journal.create(folder, SETTINGS, random_bundle.path)
 
 
-def damage_foreign(path):
+def change(path, statement):
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute(statement)
+
+
+def replace_by_foreign(path):
     path.unlink()
-    sqlite3.connect(path).execute("CREATE TABLE t (x)").connection.close()
-
-
-def damage_text(path):
-    path.write_text("this is no database, it is a text that is long enough to be mistaken for one" * 20)
-
-
-def of_version(number):
-    def damage(path):
-        with closing(sqlite3.connect(path)) as connection:
-            connection.execute(f"PRAGMA user_version = {number}")
-
-    return damage
+    change(path, "CREATE TABLE t (x)")
 
 
 @pytest.mark.parametrize(
     ("damage", "error"),
-    [(damage_foreign, JournalError), (damage_text, DamagedJournalError), (of_version(99), JournalError),
-     (of_version(9), JournalError), (of_version(1), JournalError)],
+    [
+        (replace_by_foreign, JournalError),
+        (lambda path: path.write_text("this is no database, and long enough to be taken for one" * 20),
+         DamagedJournalError),
+        *((partial(change, statement=f"PRAGMA user_version = {number}"), JournalError)
+          for number in (-5, 0, 1, 2, 8, 9, 99)),
+    ],
 )  # fmt: skip
 def test_a_foreign_or_damaged_journal_is_refused_and_untouched(folder, damage, error):
     path = folder / "journal.sqlite"
@@ -209,17 +178,14 @@ def test_an_unknown_run_names_those_that_exist(folder):
         open_run(folder.parent, "nighte")
 
 
-def test_a_folder_is_held_by_one(folder):
-    with run_lock(folder), pytest.raises(UsageError, match="night"), run_lock(folder):
-        pass
-
-
-def test_a_run_is_live_while_its_folder_is_held(journal, folder):
+def test_a_run_is_live_while_its_folder_is_held_by_one(journal, folder):
     journal.commit()
     with RunFolder(folder) as run:
         assert run.state == "open"
         with run_lock(folder):
             assert run.state == "live"
+            with pytest.raises(UsageError, match="night"), run_lock(folder):
+                pass
         assert run.state == "open"
     journal.set_fact("ended", "7 generations")
     journal.commit()
@@ -301,14 +267,6 @@ def read(folder):
         return run.history()
 
 
-def test_a_reader_leaves_nothing_beside_a_run_that_is_not_served(folder, journal):
-    fill(journal)
-    journal.close()
-    assert side_files(folder) == []
-    assert read(folder)
-    assert side_files(folder) == []
-
-
 @pytest.mark.parametrize("readers", [1, 3])
 def test_the_last_reader_of_a_run_that_ended_meanwhile_leaves_nothing(folder, journal, readers):
     fill(journal)
@@ -319,6 +277,8 @@ def test_the_last_reader_of_a_run_that_ended_meanwhile_leaves_nothing(folder, jo
     for each in opened:
         assert each.history() == before[0]
         each.close()
+    assert side_files(folder) == []
+    assert read(folder) == before[0], "though nobody serves it any more"
     assert side_files(folder) == []
 
 
