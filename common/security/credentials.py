@@ -100,13 +100,18 @@ def identity(role: str, seat: int) -> str:
 
 
 def worker_seat_identity(worker: str) -> str:
-    """The identity at the router of a secured fleet's worker `<label>.<seat>/<life>`."""
-    return f"worker.{worker.partition('/')[0].rpartition('.')[2]}"
+    """The identity at the router of a secured fleet's worker, by the end of its name before `/`.
+
+    >>> worker_seat_identity("gpu.1/0badc0de"), worker_seat_identity("gpu.coordinator-2/0badc0de")
+    ('worker.1', 'coordinator.2')
+    """
+    seat = worker.partition("/")[0].rpartition(".")[2]
+    return seat.replace("-", ".") if "-" in seat else f"worker.{seat}"  # a worker's name must end in a number
 
 
 def add_seat_to_name(label: str, credentials: Credentials) -> str:
-    """A worker's name in a secured fleet: it must end in the worker's seat."""
-    end = f".{credentials.seat if credentials.role == 'worker' else credentials.role}"
+    """A worker's name in a secured fleet: it ends in its seat, and of another role in that role and seat."""
+    end = f".{credentials.seat if credentials.role == 'worker' else f'{credentials.role}-{credentials.seat}'}"
     return check_worker_name(label[: 63 - len(end)] + end)
 
 

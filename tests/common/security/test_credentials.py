@@ -59,6 +59,8 @@ def test_an_authoritys_files_are_private_and_a_join_file_identifies_its_holder(a
     assert add_seat_to_name("gpu", found) == "gpu.1"
     assert add_seat_to_name("x" * 63, found) == "x" * 61 + ".1"
     assert worker_seat_identity("gpu.1/0badc0de") == "worker.1"
+    served = replace(found, role="coordinator", seat=2)
+    assert worker_seat_identity(f"{add_seat_to_name('gpu', served)}/0badc0de") == served.identity
     assert stat.S_IMODE(access._folder.stat().st_mode) == 0o700
     modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in access._folder.iterdir() if path.name != "lock"}
     assert modes == dict.fromkeys(("ca.pem", "ca.key", "issued.json", "box.join"), 0o600)
