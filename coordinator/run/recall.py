@@ -12,9 +12,8 @@ from pathlib import Path
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import plural, printable
 from dreamfleet.common.runs.records import RunSettings
-from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_lock import run_lock
-from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL
+from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.common.runs.stages import StageTracker
 from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.jobs.history import History
@@ -84,7 +83,7 @@ def bar_stored(folder: Path, host: str, *, is_barred: bool) -> str:
     R33: what it brought is taken back, so an ended run is open again. `UsageError` if the run is served, or if there is
     nothing to do; `DamagedJournalError` if the journal is not what was written. Then nothing is changed.
     """
-    with run_lock(folder), closing(_verified(folder)) as journal:
+    with run_lock(folder), closing(Journal.open_verified(folder)) as journal:
         known = {*map(host_of, journal.results.workers(recalled=True))}
         if problem := find_bar_problem(host, journal.verification.barred(), known, is_barred=is_barred):
             raise UsageError(problem)
@@ -103,13 +102,6 @@ def bar_stored(folder: Path, host: str, *, is_barred: bool) -> str:
         journal.commit()
         RolloutCollections(folder).remove(journal.recalls.rollouts())  # not before the recall was durable
     return text
-
-
-def _verified(folder: Path) -> Journal:
-    """The journal of a run that this process locked, compared with its checksums: a recall replays what it holds."""
-    with RunFolder(folder) as stored:
-        stored.verify()
-    return Journal(folder / JOURNAL)
 
 
 def unbar_words(host: str) -> str:

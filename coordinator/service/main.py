@@ -23,7 +23,7 @@ from dreamfleet.common.runs.own_runs import remember_run
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_folder import EPISODE_LIMIT, open_run
 from dreamfleet.common.runs.run_lock import run_lock
-from dreamfleet.common.runs.run_paths import ARCHIVE, BUNDLE, JOURNAL, resume_command
+from dreamfleet.common.runs.run_paths import ARCHIVE, BUNDLE, resume_command
 from dreamfleet.common.security.anchor_key import make_anchor_key
 from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, RevocationWatcher
 from dreamfleet.common.security.credentials import Credentials
@@ -108,14 +108,28 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
     """
     stop = Stop()
     on_stoppable(stop)
-    while True:
-        run = _serve_life(request, stop)
-        if not run.state.is_rewound or stop.is_requested:
-            return run
-        request = replace(request, config=None, start=None)
+    with ExitStack() as lock:
+        kept = _Kept(lock)
+        while True:
+            run = _serve_life(request, stop, kept)
+            if not run.state.is_rewound or stop.is_requested:
+                return run
+            request = replace(request, config=None, start=None)
 
 
-def _serve_life(request: RunRequest, stop: Stop) -> Run:
+@dataclass
+class _Kept:
+    """What one life of the coordinator leaves to the next: the lock of the run's folder, and which seats are revoked.
+
+    Between two lives no other program may take the run, and the list of revoked seats may be missing for a while.
+    """
+
+    lock: ExitStack
+    is_locked: bool = False
+    revocations: RevocationWatcher | None = None
+
+
+def _serve_life(request: RunRequest, stop: Stop, kept: _Kept) -> Run:
     """Serve one incarnation of a run."""
     folder = request.folder
     if request.config is not None and request.name == ARCHIVE:
@@ -134,14 +148,14 @@ def _serve_life(request: RunRequest, stop: Stop) -> Run:
     with ExitStack() as stack:
         journal: Journal | None = None
         if request.config is None:
-            journal = _open_journal(request, folder, settings, bundle, {}, stack)
-        revocations = _watch_revocations(request, journal)
+            journal = _open_journal(request, folder, settings, bundle, {}, stack, kept)
+        revocations = kept.revocations = kept.revocations or _watch_revocations(request, journal)
 
         def open_run() -> OpenRun:
             """The run; a new one is created here, once its addresses and its name are its own."""
             nonlocal journal
             known = {EPISODE_LIMIT: str(limit)} if limit else {}
-            journal = journal or _open_journal(request, folder, settings, bundle, known, stack)
+            journal = journal or _open_journal(request, folder, settings, bundle, known, stack, kept)
             served = stack.enter_context(closing(ServedBundle(folder / BUNDLE))) if bundle else None
             file_watch = FileWatch(journal, served, request.with_absolute_paths.resume_command)
             stack.enter_context(closing(file_watch))
@@ -192,16 +206,18 @@ def _service(request: RunRequest, revocations: RevocationWatcher, word: str) -> 
 
 def _open_journal(
     request: RunRequest, folder: Path, settings: RunSettings, bundle: Bundle | None, known: Mapping[str, str],
-    stack: ExitStack,
+    stack: ExitStack, kept: _Kept,
 ) -> Journal:  # fmt: skip
     """Lock the run's folder, and open its journal with its limits, network settings and, of a new run, its start point.
 
     They are durable before anything else can fail: a coordinator that is killed resumes with all its settings.
-    `known` are more facts of a new run; `stack` closes the journal and releases the folder.
+    `known` are more facts of a new run; `stack` closes the journal.
     """
     with reporting_unwritable_folder(request.runs_dir, "choose another --runs-dir", JournalError):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    stack.enter_context(run_lock(folder))
+    if not kept.is_locked:
+        kept.lock.enter_context(run_lock(folder))
+        kept.is_locked = True
     facts = serving_facts(request.limits, request.network)
     if request.config is not None:
         start = request.start.facts if request.start else {}
@@ -210,7 +226,7 @@ def _open_journal(
         journal = stack.enter_context(closing(Journal.create(folder, settings, bundle.path if bundle else None, own)))
         remember_run(journal.fact("uid") or "", settings.task.task, settings.task.options)
         return journal
-    journal = stack.enter_context(closing(Journal(folder / JOURNAL)))
+    journal = stack.enter_context(closing(Journal.open_verified(folder)))
     for name, text in facts.items():
         journal.set_fact(name, text)
     journal.commit()
@@ -221,7 +237,7 @@ def _resolve_settings(request: RunRequest, folder: Path) -> tuple[RunSettings, B
     """The run's settings, its verified bundle if its task needs one, and a new run's `_episode_limit`."""
     if request.config is not None:
         return _resolve_new_settings(request.config, request.start, strict=request.network.strict)
-    with open_run(request.runs_dir, request.name) as stored, stored.verified_transaction():
+    with open_run(request.runs_dir, request.name) as stored:
         settings = stored.settings
     if not settings.task.bundle:
         return settings, None, 0

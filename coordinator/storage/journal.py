@@ -110,6 +110,13 @@ class Journal(JournalConnection):
             fsync_path(folder)
         return cls(path)
 
+    @classmethod
+    def open_verified(cls, folder: Path) -> Journal:
+        """The journal of a run that this process locked, once it was compared with its checksums."""
+        with RunFolder(folder) as stored:
+            stored.verify()
+        return cls(folder / JOURNAL)
+
     @staticmethod
     def check_absent(folder: Path) -> None:
         """`JournalError` if `folder` holds a run already."""

@@ -1,0 +1,59 @@
+"""One coordinator serves a run that was taken back in another life. Tests coordinator/service/main.py."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from dreamfleet.common.errors import UsageError
+from dreamfleet.common.runs.run_lock import run_lock
+from dreamfleet.common.security.certificate_ledger import LEDGER_FILE
+from dreamfleet.common.security.credentials import read_join_file
+from dreamfleet.coordinator.run.recall import bar_stored
+from dreamfleet.coordinator.service import main
+from dreamfleet.coordinator.settings.limits import LimitsConfig
+from dreamfleet.coordinator.settings.network import NetworkConfig
+from tests.support.access import Access
+from tests.support.failing_runs import SETTINGS, finished
+
+LEDGERS = {"missing": lambda path: path.unlink(), "half copied": lambda path: path.write_bytes(path.read_bytes()[:99])}
+
+
+@pytest.mark.parametrize("ledger", LEDGERS)
+def test_the_next_life_keeps_the_lock_and_the_revoked_seats(tmp_path, random_bundle, monkeypatch, ledger):
+    bench = finished(tmp_path / "runs", random_bundle, fails=lambda _: False)
+    bench.run.leave()
+    bench.journal.close()
+    access = Access(tmp_path / "access")
+    access.authority.revoke("first")
+    seats, revoked = [], {"worker.1"}
+
+    def resolve(request, folder):
+        """Between two lives nobody else gets the run."""
+        if seats:
+            with pytest.raises(UsageError):
+                bar_stored(folder, "b", is_barred=True)
+        return SETTINGS, None, 0
+
+    def serve(open_run):
+        run = open_run().run
+        if len(seats) == 1:
+            assert run.bar("a") == ""
+            LEDGERS[ledger](access.folder / LEDGER_FILE)
+        return run
+
+    def service(request, revocations, word):
+        seats.append(revocations.revoked_seats)
+        return SimpleNamespace(stop=lambda: None, serve=serve)
+
+    monkeypatch.setattr(main, "_resolve_settings", resolve)
+    monkeypatch.setattr(main, "_service", service)
+    request = main.RunRequest(
+        bench.path.name, bench.path.parent, None, LimitsConfig(), NetworkConfig(),
+        credentials=read_join_file(access.path("coordinator")), access_dir=access.folder,
+    )  # fmt: skip
+    run = main.serve_run(request)
+    assert not run.state.is_rewound
+    assert list(run.admission.barred) == ["a"]
+    assert seats == [revoked, revoked]
+    with run_lock(bench.path):
+        pass
