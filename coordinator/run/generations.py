@@ -149,10 +149,6 @@ class Generations:
         self._begin_search(number)
         return self._strategy.state()
 
-    def first_seeds(self, number: int) -> list[int]:
-        """The seeds of a generation of the journal, as it was first asked for."""
-        return training_seeds(self._settings.seed, number, len(self._journal.seeds_of(number)))
-
     def close(self, generation: Generation, seconds: float) -> StoredGeneration:
         """Give the strategy the generation's fitness and journal the generation, which took `seconds`.
 

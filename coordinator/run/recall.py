@@ -14,6 +14,7 @@ from dreamfleet.common.printable import plural, printable
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.runs.run_paths import CONTROLLER
+from dreamfleet.common.runs.seeds import training_seeds
 from dreamfleet.common.runs.stages import StageTracker
 from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.jobs.history import History
@@ -47,7 +48,8 @@ def recall(journal: Journal, settings: RunSettings, hosts: Collection[str]) -> s
     replayed = Generations(journal, settings, StageTracker(settings), History(closed), finished)
     stored = journal.generation(first)  # only of the last two
     state = replayed.replay(first) if stored is None else stored.state
-    journal.recalls.rewind(first, state, replayed.first_seeds(first))
+    seeds = training_seeds(settings.seed, first, len(journal.seeds_of(first)))  # as it was first asked for
+    journal.recalls.rewind(first, state, seeds)
     forget_acceptance(journal, first)
     return f"{words}: the run goes on from generation {first}" + (f" (of {last.number})" if last.number > first else "")
 

@@ -132,9 +132,9 @@ class _Kept:
 def _serve_life(request: RunRequest, stop: Stop, kept: _Kept) -> Run:
     """Serve one incarnation of a run."""
     folder = request.folder
-    if request.config is not None and request.name == ARCHIVE:
-        raise UsageError(f"{ARCHIVE!r} is where archived runs lie: choose another name")
     if request.config is not None:
+        if request.name == ARCHIVE:
+            raise UsageError(f"{ARCHIVE!r} is where archived runs lie: choose another name")
         Journal.check_absent(folder)  # before the task is tried, which may take minutes
     _check_file_system(folder)
     if log_to := request.network.log_to:
@@ -166,16 +166,17 @@ def _serve_life(request: RunRequest, stop: Stop, kept: _Kept) -> Run:
             return OpenRun(run, file_watch, served)
 
         word = score_word(settings.task.task) if bundle is None else bundle.manifest.facts.score_word
-        service = _service(request, revocations, word)
+        own, intervals = request.network, Intervals(request.network.beat, request.network.beat)
+        network = Network(own.listen, own.connect, request.credentials, revocations.revoked_seats)
+        service = Service(request.name, network, intervals, own.metrics_port, revocations, word)
         stop.stop_service = service.stop
         if stop.is_requested:
             service.stop()
         try:
             return service.serve(open_run)
         except JournalError as error:
-            if not isinstance(error.__cause__, (OSError, sqlite3.OperationalError)):
-                raise
-            if journal is None or not journal.is_whole:
+            was_refused = isinstance(error.__cause__, (OSError, sqlite3.OperationalError))
+            if not was_refused or journal is None or not journal.is_whole:
                 raise
             raise JournalError(f"{error}; continue it with: {request.resume_command()}") from error
 
@@ -195,13 +196,6 @@ def _watch_revocations(request: RunRequest, journal: Journal | None) -> Revocati
     fact = journal.fact(REVOKED) if journal is not None else start.revoked if start is not None else None
     kept = () if credentials is None else revoked_seats_in(fact, credentials.authority)
     return RevocationWatcher(request.access_dir, credentials, kept, named=request.is_access_dir_named)
-
-
-def _service(request: RunRequest, revocations: RevocationWatcher, word: str) -> Service:
-    network = request.network
-    intervals = Intervals(network.beat, network.beat)
-    reached = Network(network.listen, network.connect, request.credentials, revocations.revoked_seats)
-    return Service(request.name, reached, intervals, network.metrics_port, revocations, word)
 
 
 def _open_journal(

@@ -44,7 +44,3 @@ class ChecksumRecords:
         """Write the strategy's state before a generation was asked for; the journal packs it when it writes."""
         query = "INSERT INTO strategy (generation, state, checksum) VALUES (?1, ?2, state_checksum(?1, ?2))"
         self._journal.write(query, generation, state)
-
-    def write_rest(self) -> None:
-        """Write the checksum of what belongs to no generation: nothing comes any more."""
-        self._journal.set_fact(checksums.REST, checksums.rest_checksum(self._journal.read))

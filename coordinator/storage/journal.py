@@ -25,7 +25,7 @@ from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import Job, Kind
 from dreamfleet.common.protocol.result_bounds import to_finite
 from dreamfleet.common.runs.journal import schema
-from dreamfleet.common.runs.journal.checksums import RECORD, REST, record_checksum, state_checksum
+from dreamfleet.common.runs.journal.checksums import RECORD, REST, record_checksum, rest_checksum, state_checksum
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import ENDED_AT, RunFolder
 from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL
@@ -169,7 +169,7 @@ class Journal(JournalConnection):
         self.set_patience(LEAVING_PATIENCE)
         self.add_event("the coordinator leaves", LEAVES)
         if self.fact("ended") is not None:
-            self.checksums.write_rest()
+            self.set_fact(REST, rest_checksum(self.read))  # nothing comes any more
 
     def open_generation(
         self, number: int, state: Checkpoint, sigma: float, seeds: Sequence[int], vectors: Sequence[bytes]

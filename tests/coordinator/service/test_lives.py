@@ -1,10 +1,15 @@
-"""One coordinator serves a run that was taken back in another life. Tests coordinator/service/main.py."""
+"""One coordinator serves a run that was taken back in another life. Tests coordinator/service/main.py and
+coordinator/verbs/bar.py."""
 
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
 
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.cli.command_line import main as call
+from dreamfleet.common.client import client
+from dreamfleet.common.errors import ConnectionFailedError, UsageError
+from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.security.certificate_ledger import LEDGER_FILE
 from dreamfleet.common.security.credentials import read_join_file
@@ -12,6 +17,7 @@ from dreamfleet.coordinator.run.recall import bar_stored
 from dreamfleet.coordinator.service import main
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
+from dreamfleet.coordinator.verbs import bar
 from tests.support.access import Access
 from tests.support.failing_runs import SETTINGS, finished
 
@@ -41,12 +47,12 @@ def test_the_next_life_keeps_the_lock_and_the_revoked_seats(tmp_path, random_bun
             LEDGERS[ledger](access.folder / LEDGER_FILE)
         return run
 
-    def service(request, revocations, word):
+    def service(name, network, intervals, metrics_port, revocations, word):
         seats.append(revocations.revoked_seats)
         return SimpleNamespace(stop=lambda: None, serve=serve)
 
     monkeypatch.setattr(main, "_resolve_settings", resolve)
-    monkeypatch.setattr(main, "_service", service)
+    monkeypatch.setattr(main, "Service", service)
     request = main.RunRequest(
         bench.path.name, bench.path.parent, None, LimitsConfig(), NetworkConfig(),
         credentials=read_join_file(access.path("coordinator")), access_dir=access.folder,
@@ -57,3 +63,22 @@ def test_the_next_life_keeps_the_lock_and_the_revoked_seats(tmp_path, random_bun
     assert seats == [revoked, revoked]
     with run_lock(bench.path):
         pass
+
+
+def test_a_coordinator_between_two_lives_is_asked_again(tmp_path, random_bundle, monkeypatch):
+    bench = finished(tmp_path / "runs", random_bundle, fails=lambda _: False)
+    bench.journal.close()
+    asked = []
+
+    def control(*about):
+        asked.append(about)
+        if len(asked) < 3:
+            raise ConnectionFailedError("nobody answers")
+
+    monkeypatch.setattr(client, "Client", lambda _: nullcontext(SimpleNamespace(control=control)))
+    monkeypatch.setattr(bar, "sleep", lambda seconds: None)
+    with run_lock(bench.path):
+        assert call(["bar", "a", "night", "--runs-dir", str(bench.path.parent)]) == 0
+    assert asked == [("night", "bar", "a")] * 3
+    with RunFolder(bench.path) as run:
+        assert run.ended
