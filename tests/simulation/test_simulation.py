@@ -95,7 +95,7 @@ def test_what_the_product_raises_is_a_violation_with_its_place(monkeypatch):
 
 
 def test_the_simulated_journal_has_all_that_the_real_one_has():
-    on_disk = {"create", "save_copy", "is_overwritten", "check_absent", "check_incarnation"}
+    on_disk = {"create", "open_verified", "save_copy", "is_overwritten", "check_absent", "check_incarnation"}
     on_disk |= {"is_closed", "errors_of", "with_digests", "forget_totals"}  # of batches, and of SQLite
     for real, twin in ((Journal, MemoryJournal), (ResultRecords, MemoryResults), (RecallRecords, MemoryRecalls),
                        (VerificationRecords, MemoryVerification)):  # fmt: skip
