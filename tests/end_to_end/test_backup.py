@@ -14,6 +14,7 @@ from dreamfleet.coordinator.addons.runs import backup
 from tests.support.processes import ROOT, call_here
 from tests.support.same_bits import GENERATIONS, SETTINGS, outcome
 
+FIXTURES = ROOT / "tests" / "fixtures"
 FLAGS = (*SETTINGS, "--evaluate-every", 0, "--collect-every", 1, "--collect-episodes", 1)
 
 
@@ -57,7 +58,8 @@ def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, 
 @pytest.fixture
 def finished(processes):
     """A recorded run of twelve generations."""
-    shutil.copytree(ROOT / "tests" / "fixtures" / "runs" / "dream", processes.runs / "test")
+    shutil.copytree(FIXTURES / "runs" / "dream", processes.runs / "test")
+    shutil.copyfile(FIXTURES / "small.zip", processes.runs / "test" / BUNDLE)
     return processes
 
 

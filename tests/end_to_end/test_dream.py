@@ -1,42 +1,28 @@
 """Evolving in the dream, with means that are driven in reality."""
 
-import os
-import signal
-
 import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support.processes import call_here
-from tests.support.same_bits import outcome
+from tests.support.same_bits import evolve
 
-GENERATIONS, POPULATION, EPISODES = 4, 4, 3
+POPULATION, EPISODES = 4, 3
 
 
-def begin(processes, bundle, name, *flags):
-    return processes.coordinator(
-        "--preset", "dream", "--bundle", bundle.path, "--population", POPULATION, "--episodes", EPISODES,
-        "--horizon", 100, "--generations", GENERATIONS, "--evaluate-every", 2, "--evaluation-episodes", 2,
-        "--confirm-episodes", 2, *flags, name=name,
+@pytest.fixture
+def dreamt(random_bundle):
+    return (
+        "--preset", "dream", "--bundle", random_bundle.path, "--population", POPULATION, "--episodes", EPISODES,
+        "--horizon", 100, "--generations", 4, "--evaluate-every", 2, "--evaluation-episodes", 2, "--confirm-episodes",
+        2,
     )  # fmt: skip
 
 
 @pytest.mark.long
-def test_who_dreams_on_a_torch_device_changes_no_bit_either(processes, random_bundle, monkeypatch):
-    coordinator = begin(processes, random_bundle, "plain", "--generations", 1)
-    worker = processes.worker("--run", "plain")
-    assert coordinator.finish()[0] == 0
-    worker.end()
+def test_who_dreams_on_a_torch_device_changes_no_bit_either(processes, dreamt, monkeypatch):
+    evolve(processes, "plain", 1, *dreamt, "--generations", 1)
     monkeypatch.setenv("DREAMFLEET_WORKER_TORCH_DEVICE", "cpu")
-    for name, workers in (("one", 1), ("two", 2)):
-        coordinator = begin(processes, random_bundle, name)
-        crew = [processes.worker("--run", name, "--name", f"w{number}") for number in range(workers)]
-        coordinator.wait_for_event("generation", number=0)
-        if workers > 1:
-            os.kill(crew.pop().popen.pid, signal.SIGKILL)
-        assert coordinator.finish()[0] == 0, "".join(coordinator.lines)
-        for each in crew:
-            each.end()
-    assert outcome(processes, "one") == outcome(processes, "two")
+    assert evolve(processes, "one", 1, *dreamt) == evolve(processes, "two", 2, *dreamt)
     classes = []
     for name in ("plain", "one", "two"):
         with open_run(processes.runs, name) as run:
@@ -68,10 +54,10 @@ DRIVEN = [0, 0, 2, 2, 2]  # of each candidate's episodes, by generation
 
 
 @pytest.mark.slow
-def test_a_run_that_dreams_then_mixes_then_drives_has_replayable_bits_through_kills(processes, random_bundle):
+def test_a_run_that_dreams_then_mixes_then_drives_has_replayable_bits_through_kills(processes, dreamt):
     path = processes.folder / "stages.toml"
     path.write_text(STAGES)
-    coordinator = begin(processes, random_bundle, "night", "--schedule", path, "--generations", len(DRIVEN))
+    coordinator = processes.coordinator(*dreamt, "--schedule", path, "--generations", len(DRIVEN), name="night")
     for number in range(2):
         processes.worker("--run", "night", "--name", f"w{number}")
     for generation in (1, 2, 3):

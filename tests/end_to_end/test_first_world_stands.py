@@ -13,10 +13,7 @@ from tests.support.first_world import GOLD, HOST, PARTS
 pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
 
 
-SLOW = {"evaluation"}  # it drives whole episodes
-
-
-@pytest.mark.parametrize("part", [pytest.param(each, marks=pytest.mark.slow if each in SLOW else ()) for each in PARTS])
+@pytest.mark.parametrize("part", PARTS)
 def test_the_first_world_computes_what_it_did(part, tmp_path):
     gold = json.loads(GOLD.read_text())[part]
     found = json.loads(json.dumps(PARTS[part](tmp_path)))

@@ -6,7 +6,7 @@ import pytest
 
 from tests.support.environments import ODD
 from tests.support.processes import call_here
-from tests.support.same_bits import outcome
+from tests.support.same_bits import evolve
 from tests.support.tables import cells
 
 NORMAL = ("--normalise", "--population", 32, "--episodes", 4, "--evaluation-episodes", 16)
@@ -22,21 +22,13 @@ LEARNT = {  # settings, generations, and the mean over 50 unseen seeds that is t
 }  # fmt: skip
 
 
-def evolve(processes, name, workers, *settings):
-    coordinator = processes.coordinator(*settings, name=name)
-    task = settings[settings.index("--task") + 1]
-    working = [processes.worker("--run", name, "--name", f"w{number}", "--task", task) for number in range(workers)]
-    assert coordinator.finish(1200)[0] == 0, "".join(coordinator.lines)
-    for each in working:
-        each.end()
-    return outcome(processes, name)
-
-
 @pytest.mark.slow
 def test_a_run_without_a_bundle_evolves_any_fleet_gives_its_bits_and_the_verbs_take_it(processes):
     settings = ("--task", "gym:CartPole-v1", "--population", 6, "--episodes", 2, "--generations", 3,
                 "--evaluate-every", 2, "--evaluation-episodes", 3)  # fmt: skip
-    assert evolve(processes, "one", 1, *settings) == evolve(processes, "two", 2, *settings)
+    one, two = (evolve(processes, name, workers, *settings, task=settings[1])
+                for name, workers in (("one", 1), ("two", 2)))  # fmt: skip
+    assert one == two
     assert not (processes.runs / "one" / "bundle.zip").exists()
 
     def call(*words):
@@ -83,14 +75,14 @@ def test_settings_that_make_no_run_are_refused(tmp_path, settings, says):
 def test_it_is_learnt_from_zero_on_two_workers_and_one_gives_the_same_bits(processes, name):
     settings, generations, wanted = LEARNT[name]
     settings = (*settings, "--generations", generations, "--evaluate-every", 10)
-    two = evolve(processes, name, 2, *settings)
+    two = evolve(processes, name, 2, *settings, task=settings[1])
     judged = ("evaluate", "--controller", name, "--runs-dir", processes.runs, "--episodes", 50, "--json")
     code, out, err = call_here(*judged)
     assert code == 0, err
     answer = json.loads(out)
     print(f"{name}: {answer['mean']:.1f}, standard error {answer['std'] / 50**0.5:.1f}, 50 unseen seeds")  # noqa: T201
     assert answer["mean"] > wanted
-    assert evolve(processes, "alone", 1, *settings) == two
+    assert evolve(processes, "alone", 1, *settings, task=settings[1]) == two
 
 
 @pytest.mark.slow

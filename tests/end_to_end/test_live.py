@@ -19,7 +19,7 @@ from dreamfleet.common.protocol.messages import ViewFrame
 from dreamfleet.common.runs.lookup import find_evaluated_mean
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
-from tests.support.processes import DEADLINE, ROOT, call_here, environment, started
+from tests.support.processes import DEADLINE, ROOT, environment, started
 from tests.support.samples import MSGPACK
 
 
@@ -129,6 +129,7 @@ def test_the_verb_ends_with_the_run_and_says_how_that_ended(processes, small, tm
     assert (code, (tmp_path / "live.mp4").stat().st_size > 1000) == (0, True), out
 
 
+@pytest.mark.slow
 def test_what_cannot_be_shown_is_said_in_one_line(processes, tmp_path):
     for flags, said in (
         (("--controller", "tiny"), "--out"),
@@ -139,7 +140,7 @@ def test_what_cannot_be_shown_is_said_in_one_line(processes, tmp_path):
         (("--controller", "gone", "--generation", 3, "--out", tmp_path / "a"), "'gone'"),
         (("--connect", "tcp/127.0.0.1:9", "--out", tmp_path / "a"), "tcp/127.0.0.1:9"),
     ):
-        code, _, err = call_here("live", "--runs-dir", processes.runs, *flags)
+        code, _, err = processes.call("live", "--runs-dir", processes.runs, *flags)
         assert (code != 0, said in err.splitlines()[-1], "Traceback" in err) == (True, True, False), err
 
 

@@ -12,27 +12,17 @@ from dreamfleet.worker.worlds.takecover.game import TakeCover
 from dreamfleet.worker.worlds.takecover.process import ARGUMENTS, FOLDER_PREFIX, GAME_NAME_FLAG
 from tests.support.doom import games, has_ended, name_of_game, shared_files
 from tests.support.processes import DEADLINE
-from tests.support.same_bits import outcome
+from tests.support.same_bits import evolve
 
 pytestmark = [pytest.mark.slow, pytest.mark.needs_doom]
 RUN = ("--task", "takecover", "--bundle", "none", "--horizon", 525)
 ROUNDS = 13  # of four kills each
 
 
-def evolve(processes, name, workers):
-    """What a run comes to on so many workers."""
-    settings = ("--population", 6, "--episodes", 2, "--generations", 2, "--evaluate-every", 1,
-                "--evaluation-episodes", 4)  # fmt: skip
-    coordinator = processes.coordinator(*RUN, *settings, name=name)
-    started = [processes.worker("--run", name, "--name", f"w{number}") for number in range(workers)]
-    assert coordinator.finish()[0] == 0, "".join(coordinator.lines)
-    for each in started:
-        each.end()
-    return outcome(processes, name)
-
-
 def test_any_fleet_gives_the_same_bits_and_the_verbs_take_the_run(processes):
-    assert evolve(processes, "one", 1) == evolve(processes, "two", 2)
+    settings = (*RUN, "--population", 6, "--episodes", 2, "--generations", 2, "--evaluate-every", 1,
+                "--evaluation-episodes", 4)  # fmt: skip
+    assert evolve(processes, "one", 1, *settings) == evolve(processes, "two", 2, *settings)
     runs = ("--runs-dir", processes.runs)
     code, out, err = processes.call("verify", "candidate", "one", *runs, "--candidate", "1/3")
     assert (code, out.count("same bits")) == (0, 2), err

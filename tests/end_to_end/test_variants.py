@@ -6,8 +6,9 @@ import pytest
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support.processes import call_here
+from tests.support.same_bits import evolve
 
-GENERATIONS, HORIZON = 2, 30
+HORIZON = 30
 RUNS = {
     "pedals": (("--variant", "pedals=one", "pedal_shift=0.25"), (288, 2)),
     "halves": (("--preset", "article"), (288, 3)),
@@ -21,24 +22,17 @@ OFTEN = ("pedals", "feedback", "dreamt")
 
 
 @pytest.fixture
-def evolve(processes, small):
-    def run(name, *flags):
-        driven = (*small, "--task", "car-racing", "--horizon", HORIZON, "--generations", GENERATIONS)
-        coordinator = processes.coordinator(*driven, *flags, name=name)
-        worker = processes.worker("--run", name)
-        assert coordinator.finish()[0] == 0, "".join(coordinator.lines)
-        worker.end()
-
-    return run
+def driven(small):
+    return (*small, "--task", "car-racing", "--horizon", HORIZON, "--generations", 2)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "kind", [*OFTEN, *(pytest.param(each, marks=pytest.mark.long) for each in RUNS if each not in OFTEN)]
 )
-def test_a_run_evolves_and_is_replayed_to_the_same_bits(processes, evolve, kind):
+def test_a_run_evolves_and_is_replayed_to_the_same_bits(processes, driven, kind):
     flags, shape = RUNS[kind]
-    evolve("one", *flags)
+    evolve(processes, "one", 1, *driven, *flags)
     with open_run(processes.runs, "one") as run:
         assert (run.settings.controller.features, run.settings.controller.actions) == shape
         assert {each.steps for each in run.results(1, 2)} == {HORIZON}
@@ -49,9 +43,9 @@ def test_a_run_evolves_and_is_replayed_to_the_same_bits(processes, evolve, kind)
 
 
 @pytest.mark.slow
-def test_every_verb_drives_as_the_run_does(processes, random_bundle, evolve):
-    evolve("one", "--variant", "pedals=one", "decide_every=3", "feedback=last", "--collect-every", 1,
-           "--collect-episodes", 1)  # fmt: skip
+def test_every_verb_drives_as_the_run_does(processes, driven):
+    variant = ("--variant", "pedals=one", "decide_every=3", "feedback=last")
+    evolve(processes, "one", 1, *driven, *variant, "--collect-every", 1, "--collect-episodes", 1)
     runs = ("--runs-dir", processes.runs)
     code, out, err = call_here("runs", "show", "one", *runs)
     assert '"decide_every": 3' in out, err

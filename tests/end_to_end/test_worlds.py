@@ -8,43 +8,29 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support.dreams import write_bundle_of
 from tests.support.pixel_world import DODGE, DODGE_TASK, MODULE
-from tests.support.same_bits import outcome
+from tests.support.same_bits import evolve
 
-GENERATIONS, POPULATION, EPISODES = 3, 6, 2
-
-
-def evolve(processes, bundle, name, workers, *flags):
-    """What a run in the bundle's dream comes to, whose means are judged in its world."""
-    coordinator = processes.coordinator(
-        "--preset", "pixels", "--bundle", bundle.path, "--population", POPULATION, "--episodes", EPISODES,
-        "--horizon", 60, "--generations", GENERATIONS, "--evaluate-every", 1, "--evaluation-episodes", 2,
-        "--confirm-episodes", 2, *flags, name=name,
-    )  # fmt: skip
-    crew = [processes.worker("--run", name, "--name", f"w{number}", "--task", DODGE_TASK) for number in range(workers)]
-    assert coordinator.finish()[0] == 0, "".join(coordinator.lines + crew[0].lines)
-    for each in crew:
-        each.end()
-    return outcome(processes, name)
-
-
-def settings_of(processes, name):
-    with open_run(processes.runs, name) as run:
-        return run.settings
+EPISODES = 2
 
 
 @pytest.mark.slow
 def test_a_bundles_world_gives_the_same_bits_on_one_worker_and_on_two_and_a_runs_own_end_other_dreams(
     processes, tmp_path
 ):
-    bundle, variant = write_bundle_of("choices", tmp_path / "b.zip"), ("--variant", "decide_every=2")
-    alone = evolve(processes, bundle, "alone", 1, *variant)
-    assert alone == evolve(processes, bundle, "two", 2, *variant)
-    own = evolve(processes, bundle, "own", 1, *variant, "--end", "0.999")
+    bundle = write_bundle_of("choices", tmp_path / "b.zip")
+    settings = (
+        "--preset", "pixels", "--bundle", bundle.path, "--population", 6, "--episodes", EPISODES, "--horizon", 60,
+        "--generations", 3, "--evaluate-every", 1, "--evaluation-episodes", 2, "--confirm-episodes", 2,
+        "--variant", "decide_every=2",
+    )  # fmt: skip
+    alone = evolve(processes, "alone", 1, *settings, task=DODGE_TASK)
+    assert alone == evolve(processes, "two", 2, *settings, task=DODGE_TASK)
+    own = evolve(processes, "own", 1, *settings, "--end", "0.999", task=DODGE_TASK)
     assert own.fitness != alone.fitness
-    task = settings_of(processes, "own").task
-    assert (task.end, task.version) == ("0.999", 11)
-    settings = settings_of(processes, "alone")
-    assert (settings.task.task, settings.controller.actions) == ("dream", 3)
+    with open_run(processes.runs, "own") as run:
+        assert (run.spec.end, run.spec.version) == ("0.999", 11)
+    with open_run(processes.runs, "alone") as run:
+        assert (run.spec.task, run.settings.controller.actions) == ("dream", 3)
     assert any(alone.fitness), "somebody lived"
     runs = ("--runs-dir", processes.runs)
     code, out, err = processes.call("verify", "candidate", "alone", *runs, "--candidate", "1/2", "--trust", MODULE)

@@ -1,4 +1,4 @@
-"""What CarRacing, the first world, computes: its drives, world models, trainings, dreams, evaluation and settings.
+"""What CarRacing, the first world, computes: its drives, world models, trainings, dreams and settings.
 
 `python -m tests.support.first_world [PART ...]` writes these parts, or all, into `tests/fixtures/world_model.json`.
 Do that only for a change that means to move them, and say in its message why they move.
@@ -31,7 +31,6 @@ from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.presets import find_preset
-from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
 from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.scoring.rollout import write_episode
 from dreamfleet.worker.scoring.scorer import Scorer
@@ -240,23 +239,6 @@ def episodes(_folder):
     return {"simulator": found}
 
 
-def evaluation(folder):
-    """The report of `evaluate` on whole episodes, and its text; they name no version and no time."""
-    out = folder / "report.json"
-    with processes_in(folder) as processes:
-        code, _, err = processes.call("evaluate", "--controller", "tiny", "--episodes", 2, "--jobs", 2, "--out", out)
-    assert code == 0, err
-    report = json.loads(out.read_text())
-    names = list(report)
-    for name in ("seconds", "version", "fingerprint"):
-        del report[name]
-    same = ("name", "controller", "task", "world", "bundle", "judge", "threshold", "seeds", "n")
-    return {
-        "everywhere": {"names": names, **{name: report[name] for name in same}},
-        "simulator": {"report": report, "text": read_evaluation_report(out).description.splitlines()[:-1]},
-    }
-
-
 def settings(folder):
     """The settings that a run's journal holds, by flags and by presets, and the digest of a job."""
     with processes_in(folder) as processes:
@@ -278,7 +260,7 @@ def ignore(*_):
 
 
 PARTS: dict[str, Callable[[Path], dict[str, dict]]] = {
-    each.__name__: each for each in (drives, bundles, trainings, dreams, episodes, evaluation, settings)
+    each.__name__: each for each in (drives, bundles, trainings, dreams, episodes, settings)
 }
 
 

@@ -1,4 +1,4 @@
-"""The outcome of a run, and a short run in the dream."""
+"""The outcome of a run, and a short run in the world of the car."""
 
 from typing import NamedTuple
 
@@ -41,3 +41,14 @@ def outcome(processes, name):
             run.confirmation(),
             np.load(run.controller_path)["parameters"].tobytes(),
         )
+
+
+def evolve(processes, name, workers, *settings, task=()):
+    """The outcome of a run on so many workers, which end with it; they announce this task."""
+    coordinator = processes.coordinator(*settings, name=name)
+    announced = ("--task", task) if task else ()
+    crew = [processes.worker("--run", name, "--name", f"w{number}", *announced) for number in range(workers)]
+    assert coordinator.finish(1200)[0] == 0, "".join(line for each in (coordinator, *crew) for line in each.lines)
+    for each in crew:
+        each.end()
+    return outcome(processes, name)
