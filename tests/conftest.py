@@ -2,6 +2,7 @@ import os
 import re
 import signal
 import tempfile
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -24,13 +25,20 @@ if (
 settings.register_profile("dreamfleet", deadline=None)  # no test is timed: a busy machine is no counterexample
 settings.load_profile("dreamfleet")
 
+ADD_ON_OPTIMISERS = {each.name for each in entry_points(group="dreamfleet.optimisers") if ".addons." in each.value}
 EXACT = re.compile(r"(^|_)(bits?|same|equals?|identical|replay\w*|reproduc\w*|determin\w*|exact\w*)(_|$)")
 
 
 @pytest.hookimpl(tryfirst=True)  # before those that `-m` leaves out are left out
 def pytest_collection_modifyitems(items):
-    """Mark the tests of equal bits, of the simulation and of chaos, and those that search for a counterexample."""
+    """Mark the tests of equal bits, of the simulation and of chaos, and those that search for a counterexample.
+
+    Those with an optimiser that is an add-on as their parameter need an add-on.
+    """
     for item in items:
+        values = item.callspec.params.values() if hasattr(item, "callspec") else ()
+        if any(isinstance(each, str) and each in ADD_ON_OPTIMISERS for each in values):
+            item.add_marker("add_on")
         is_exact = {"simulation", "chaos"} & {*item.path.parts} or EXACT.search(item.name.partition("[")[0])
         if is_exact or getattr(getattr(item, "obj", None), "is_hypothesis_test", False):
             item.add_marker("exact")

@@ -15,6 +15,7 @@ def registered(monkeypatch):
     return register
 
 
+@pytest.mark.add_on
 def test_each_that_is_registered_loads():
     points = entry_points(group="dreamfleet.addons")
     assert len(points) >= 6

@@ -28,6 +28,7 @@ def test_a_moment_for_people():
     assert [format_time(each) for each in odd] == [*odd.values()]
 
 
+@pytest.mark.add_on
 @pytest.mark.parametrize("begun", [None, "", "x", "1970-01-01T00:00:00", "9999-12-31T23:59:59-23:00"])
 def test_every_verb_about_a_run_reads_its_odd_times(begun, tmp_path, capsys):
     runs = shutil.copytree(RUNS, tmp_path / "runs")

@@ -164,6 +164,7 @@ def test_a_state_of_another_version_is_refused_with_the_remedy(optimiser, covari
         evolution.restore(changed.packed())
 
 
+@pytest.mark.add_on
 def test_a_state_of_another_optimiser_is_refused():
     with pytest.raises(JournalError, match=r"'cmaes-sep'.* 'cma'"):
         Evolution(*config("cma")).restore(Evolution(*config("cmaes-sep")).state().packed())

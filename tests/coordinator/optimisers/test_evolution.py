@@ -68,6 +68,7 @@ def test_impossible_settings_are_refused(changes):
         build(**changes)
 
 
+@pytest.mark.add_on
 @pytest.mark.parametrize("search", [{"covariance": "full"}, {"covariance": "diagonal"}, {"optimiser": "cmaes-sep"},
                                     {"optimiser": "cmaes-lra"}])  # fmt: skip
 def test_the_axis_ratio_shows_how_far_from_round_a_search_is(search):

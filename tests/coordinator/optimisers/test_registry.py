@@ -69,6 +69,7 @@ def test_an_unknown_or_incomplete_optimiser_is_refused_with_what_is_missing(name
         build(name)
 
 
+@pytest.mark.add_on
 @pytest.mark.parametrize(
     ("arguments", "names"),
     [
@@ -147,6 +148,7 @@ def test_starting_the_command_line_imports_no_optimiser():
     assert entry_points(group=registry.GROUP)
 
 
+@pytest.mark.add_on
 def test_a_state_that_the_journal_cannot_keep_is_refused(monkeypatch):
     monkeypatch.setattr("dreamfleet.coordinator.optimisers.registry.usable_memory", lambda: 10**18)
     check_memory("cma", 5_000, 32, {"covariance": "full"})

@@ -122,7 +122,7 @@ def test_a_run_of_task_dream_that_drives_too_may_charge_its_drives(random_bundle
         ({"task": "gym:CartPole-v1", "recorded": 0.5}, "--recorded"),
         ({"task": "dream", "recorded": 0.5}, "--recorded"),  # the bundle holds no such states
         ({"optimiser": "cmea"}, "'cmea'"),
-        ({"optimiser": "cmaes-sep", "covariance": "full"}, "--covariance"),
+        pytest.param({"optimiser": "cmaes-sep", "covariance": "full"}, "--covariance", marks=pytest.mark.add_on),
         ({"optimiser_options": ("restarts=3",)}, "'restarts'.* covariance"),
         ({"population": 2}, "867 .*--population"),
         ({"controller": "hidden", "hidden_units": 10**5, "covariance": "full"}, "--covariance"),
@@ -156,6 +156,7 @@ def test_a_start_that_drives_otherwise_or_is_of_another_length_is_refused_and_on
 HALF, HELD = '{"pedals": "half"}', '{"decide_every": 2, "pedals": "half"}'
 
 
+@pytest.mark.add_on
 @pytest.mark.parametrize(
     ("texts", "options"),
     [
@@ -170,6 +171,7 @@ def test_what_is_said_of_a_variant_is_stronger_than_the_presets_name_by_name(ran
     assert freeze(found, random_bundle).task.options == options
 
 
+@pytest.mark.add_on
 def test_a_preset_with_a_world_model_is_of_that_world_alone_and_a_variant_of_those_that_have_one():
     article, real = (
         load(RunConfig, "run", file={"run": {"preset": preset, "task": "gym:CartPole-v1"}}, preset=find_preset)

@@ -152,6 +152,7 @@ def test_without_a_torch_device_no_part_of_a_batch_waits(pool):
     assert fleet.score(3)[2] == [3]
 
 
+@pytest.mark.add_on
 def test_a_torch_device_that_is_not_there_ends_the_worker_at_once(random_bundle):
     with pytest.raises(DreamfleetError, match="'sun'"):
         Pool("dream", random_bundle, 1, torch_device="sun")

@@ -205,6 +205,7 @@ def test_a_graph_of_endless_fields_is_not_looked_through(random_bundle, tmp_path
         write_bundle(tmp_path / "b.zip", random_bundle.manifest, parts)
 
 
+@pytest.mark.add_on
 @pytest.mark.parametrize("place", ["", "episodes"])
 @pytest.mark.parametrize("content", ["arrays", "half"])
 def test_files_of_another_program_are_named_and_never_advised_to_be_deleted(tmp_path, place, content, capsys):

@@ -60,6 +60,7 @@ def test_the_notebooks_trainings_end_with_their_last_update():
     assert PRESETS["attentive"].collect.steps == 384
 
 
+@pytest.mark.add_on
 def test_take_covers_models_predict_no_reward_and_weigh_its_ends_and_small_things():
     preset = PRESETS["takecover"]
     assert (preset.task, preset.collect.driver, preset.mdnrnn_layers.outputs) == ("takecover", "held", 961)

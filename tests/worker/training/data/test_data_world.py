@@ -207,6 +207,7 @@ def test_without_flags_a_new_data_set_is_of_the_first_world(tmp_path):
     assert find_own_world(tmp_path) is None
 
 
+@pytest.mark.add_on
 def test_a_preset_is_of_the_data_sets_world(tmp_path):
     store_preset(tmp_path, "pixels", 3, CART)
     assert (world_of_folder(tmp_path), load_preset(tmp_path)) == (CART, "pixels")

@@ -228,6 +228,7 @@ def test_an_environment_that_nobody_resets_starts_no_game(doom):
     environment.close()
 
 
+@pytest.mark.add_on
 def test_the_list_of_tasks_names_the_missing_package(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "vizdoom", None)
     assert main(["tasks", "--json"]) == 0

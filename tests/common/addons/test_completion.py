@@ -1,4 +1,4 @@
-"""`dreamfleet completion` writes scripts that complete in real shells. Tests common/addons/completion.py."""
+"""`dreamfleet completion` writes scripts that complete in real shells."""
 
 import re
 import subprocess
