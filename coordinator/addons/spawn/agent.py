@@ -35,6 +35,7 @@ DRAIN_TIMEOUT = 900.0  # seconds that a draining worker may take
 STOP_AT_ONCE = ((signal.SIGTERM, 1.0), (signal.SIGTERM, 10.0), (signal.SIGKILL, 30.0))  # each with its timeout
 STOP_DRAINED = ((signal.SIGTERM, DRAIN_TIMEOUT),)
 LEAST_FREE = 700_000_000  # bytes needed while an environment is made
+ROOM, LEAST_ROOM = "room", 1 << 16  # a file, and its bytes, that must fit before a worker is replaced
 LONGEST_TAIL = 8192  # bytes read from the end of a log for its last line
 LONGEST_LIST = 1 << 20  # bytes read of the list of folders
 JOIN, LOG, STATE, COMPLETE, CREATED = "join", "log", "worker.json", "whole", "made"
@@ -354,7 +355,7 @@ class WorkerProcess:
     def describe(self) -> dict[str, Any]:
         """Its state, as sent to the other side."""
         running = self.is_alive
-        age = time.time() - self.state["since"] if running else None
+        age = max(time.time() - self.state["since"], 0.0) if running else None  # its clock may have been set back
         return {"name": self.folder.name, "running": running, "slots": self.state.get("slots"), "age": age,
                 "digest": self.state.get("digest"), "last": last_line(self.folder / LOG)}  # fmt: skip
 
@@ -469,6 +470,9 @@ def start(host_folder: HostFolder, request: dict[str, Any]) -> dict[str, Any]:
             return {**found.describe(), "outcome": "running"}
         found.check_known()
         outcome = "replaced" if found.is_alive else "started"
+        if found.is_alive:  # a full disk must fail before it ends
+            _write_private(folder / ROOM, bytes(LEAST_ROOM))
+            (folder / ROOM).unlink()
         found.end(host_folder.channel, STOP_DRAINED)
         folder.mkdir(parents=True, exist_ok=True)
         for name, data in request["files"].items():
@@ -521,7 +525,7 @@ def _wait_for_begin(began: subprocess.Popen[bytes], folder: Path, channel: Chann
         if "begun" in _reports(folder) and last_line(folder / LOG):  # which its status then shows
             return
         channel.wait_for_request()
-    if began.poll():
+    if began.poll() or (began.poll() is not None and "begun" not in _reports(folder)):
         why = _reports(folder).get("failure") or last_line(folder / LOG) or f"exit code {began.returncode}"
         raise FailedError(f"its worker ended at once: {why}")
 

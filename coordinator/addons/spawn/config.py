@@ -78,6 +78,8 @@ class Host:
         is_default = not joins and all(map(is_loopback, endpoints))
         if not (is_default if self.spawn.tunnel is None else self.spawn.tunnel):
             return ()
+        if joins:
+            raise UsageError("--tunnel carries tcp alone, which ssh encrypts, and a join file needs tls: omit one")
         if strange := [each for each in endpoints if not each.startswith("tcp/")]:
             raise UsageError(f"--tunnel carries tcp alone, which ssh encrypts, and not {', '.join(strange)}")
         return tuple(each.removeprefix("tcp/") for each in endpoints)

@@ -36,6 +36,7 @@ QUICK, SLOW = 60.0, 1800.0  # seconds of silence: of an agent that starts or loo
 PATIENCE = 5.0  # seconds for ssh to exit
 FORWARD = 30.0  # seconds for ssh to report the tunnel's port once the agent runs
 _PORT = re.compile(r"Allocated port (\d+) for remote forward to (\S+)")
+_BRACKETS = str.maketrans("", "", "[]")  # of an IPv6 address
 NO_PYTHON = "dreamfleet-no-python"  # printed by the remote shell before the version found
 _SSH_ERRORS = (
     (r"Could not resolve hostname", "no such host: look at its address, or at HostName in ~/.ssh/config"),
@@ -72,7 +73,7 @@ class Connection:
         command = _remote_command(python, len(program))
         words = [*ssh, *OPTIONS, *(TUNNEL if forwards else ()), *tunnel, "--", address, command]
         self._stderr_lines: deque[str] = deque(maxlen=KEPT_LINES)
-        self._forwards = frozenset(forwards)
+        self._forwards = {each.translate(_BRACKETS): each for each in forwards}  # as ssh names them
         self._ports: dict[str, int] = {}
         self._stray = 0  # bytes beside answers
         self._fault = ""  # why this side ended the connection
@@ -206,8 +207,8 @@ class Connection:
             text = line.decode(errors="replace").rstrip()
             with self._changed:
                 self._stderr_lines.append(text)
-                if (found := _PORT.search(text)) and found[2] in self._forwards:
-                    self._ports[found[2]] = int(found[1])
+                if (found := _PORT.search(text)) and (forward := self._forwards.get(found[2])):
+                    self._ports[forward] = int(found[1])
                 self._changed.notify_all()
         with self._changed:
             self._changed.notify_all()

@@ -59,7 +59,13 @@ def bring_up(
 
 def _follow_until_ended(remote_host: RemoteHost) -> HostStatus:
     """Follow a worker until it ends or the command stops, which ends a worker that uses our tunnel."""
-    row = remote_host.follow()
+    try:
+        row = remote_host.follow()
+    except DreamfleetError as error:  # now, since other workers may go on for days
+        log.warning("%s: %s", remote_host.host.name, error, extra={"facts": {"event": "lost"}})
+        raise
+    if row is not None:
+        log.info("%s: its worker ended", remote_host.host.name, extra={"facts": {"event": "ended"}})
     if row is None and not remote_host.forwards:
         return HostStatus(remote_host.host.name, "running", "continues without this command; `dreamfleet down` ends it")
     ended = remote_host.end(all_workers=False, now=False, keep=True) if remote_host.forwards else None

@@ -1,5 +1,6 @@
 """The agent on hosts in unexpected states."""
 
+import errno
 import json
 import os
 import platform
@@ -7,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from contextlib import nullcontext
 
 import pytest
 
@@ -216,3 +218,31 @@ def test_a_worker_that_runs_without_its_state_is_named_and_keeps_its_folder(star
     os.waitpid(pid, 0)
     assert len(answer(ending(asked), capsys)["ok"]["ended"]) == 1
     assert not folder.parents[1].exists()
+
+
+def test_a_full_disk_ends_no_worker_that_is_to_be_replaced(started, capsys, monkeypatch):
+    asked, _, pid = started
+
+    def full(path, *_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr(agent, "_write_private", full)
+    assert "--remote-dir" in answer({**asked, "digest": "2", "files": []}, capsys)["failed"]
+    assert agent.process_start(pid)
+
+
+def test_a_workers_age_is_never_negative(started):
+    _, folder, _ = started
+    state = json.loads((folder / STATE).read_text())
+    (folder / STATE).write_text(json.dumps({**state, "since": 1e12}))
+    assert agent.WorkerProcess(folder).describe()["age"] == 0.0
+
+
+@pytest.mark.parametrize(("report", "fails"), [("", True), ('{"begun": true}\n', False)])
+def test_a_program_that_ends_well_has_been_a_worker_only_if_it_began(tmp_path, report, fails):
+    (tmp_path / agent.LOG).write_text("usage: worker\n")
+    (tmp_path / agent.REPORTS).write_text(report)
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    with pytest.raises(agent.FailedError, match="usage: worker") if fails else nullcontext():
+        agent._wait_for_begin(ended, tmp_path, Channel())

@@ -90,5 +90,6 @@ def test_a_tunnel_is_the_default_to_a_loopback_alone():
     assert forwards(None, WIDE) == forwards(None, LOOPBACK, WIDE) == forwards(False, LOOPBACK) == ()
     assert forwards(None, LOOPBACK, joins=True) == ()
     assert forwards(True, WIDE) == ("10.0.0.1:7447",)
-    with pytest.raises(UsageError, match="--tunnel"):
-        forwards(True, "tls/10.0.0.1:7447")
+    for connect, joins in ((("tls/10.0.0.1:7447",), False), ((), True)):
+        with pytest.raises(UsageError, match="--tunnel"):
+            forwards(True, *connect, joins=joins)

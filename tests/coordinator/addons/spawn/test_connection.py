@@ -1,8 +1,8 @@
-"""Messages of the ssh client, explained in one line with a remedy."""
+"""Messages of the ssh client: errors are explained in one line with a remedy, and ports of tunnels are read."""
 
 import pytest
 
-from dreamfleet.coordinator.addons.spawn.connection import NO_PYTHON, explain
+from dreamfleet.coordinator.addons.spawn.connection import NO_PYTHON, Connection, explain
 
 KINDS = [
     "ssh: Could not resolve hostname x: Name or service not known",
@@ -36,3 +36,15 @@ def test_each_kind_of_error_of_ssh_is_explained_in_a_line_of_its_own():
 )
 def test_what_the_host_said_is_named(said, named):
     assert named in explained(said)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pipes of a connection that ended
+def test_the_ports_of_tunnels_are_read_also_to_an_ipv6_address_which_ssh_names_without_brackets():
+    forwards = ("[::1]:7447", "localhost:1")
+    said = (f"Allocated port {port} for remote forward to {to}" for port, to in ((5, "::1:7447"), (6, "localhost:1")))
+    ssh = ("/bin/sh", "-c", "".join(f"echo {each} >&2; " for each in said) + "exec cat > /dev/null")
+    connection = Connection(ssh, "a", forwards=forwards)
+    try:
+        assert connection.ports(forwards) == [5, 6]
+    finally:
+        connection.close()

@@ -7,13 +7,17 @@ import shlex
 import stat
 import sys
 import time
+from threading import Event
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
-from dreamfleet.coordinator.addons.spawn import connection
+from dreamfleet.common.errors import ConnectionFailedError
+from dreamfleet.coordinator.addons.spawn import connection, parallel
 from dreamfleet.coordinator.addons.spawn.config import Host, SpawnConfig
 from dreamfleet.coordinator.addons.spawn.parallel import check
-from dreamfleet.coordinator.addons.spawn.remote_host import FAILED, FleetAddress
+from dreamfleet.coordinator.addons.spawn.remote_host import FAILED, FleetAddress, HostStatus
 from tests.support.processes import DEADLINE
 
 GOOD = 'os.execvp("/bin/sh", ["sh", "-c", sys.argv[-1]])\n'
@@ -75,3 +79,13 @@ def test_each_fails_alone_in_little_memory(fake_ssh, tmp_path, monkeypatch):
         assert row.state == FAILED, name
         assert re.search(MISBEHAVIOUR[name][1], row.what), (name, row.what)
         assert "\n" not in row.what
+
+
+def test_a_lost_host_is_said_while_others_work(monkeypatch):
+    said = Event()
+    monkeypatch.setattr(parallel, "log", Mock(warning=lambda *_, **__: said.set()))
+    lost, other = (Mock(host=SimpleNamespace(name=name)) for name in "ab")
+    lost.follow.side_effect = ConnectionFailedError("gone")
+    other.follow = lambda: HostStatus("b", "ended" if said.wait(DEADLINE) else "deaf", "")
+    rows = parallel._run_in_threads([lost, other], parallel._follow_until_ended, lambda: False, Mock())
+    assert [(row.host, row.state) for row in rows] == [("a", FAILED), ("b", "ended")]
