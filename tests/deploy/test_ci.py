@@ -60,7 +60,7 @@ def run(*names):
     return [(part.failed, part.unstable) for part in parts]
 
 
-def test_what_failed_by_chance_is_unstable_and_what_failed_twice_or_is_exact_fails_the_run(project):
+def test_what_failed_by_chance_is_unstable_and_what_failed_twice_or_runs_only_once_fails_the_run(project):
     project(chance=1, wrong=1, exact=1)
     assert run("test") == [
         (["test_it.py::test_bits[0]", "test_it.py::test_wrong[0]"], ["test_it.py::test_by_chance[0]"])

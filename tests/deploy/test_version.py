@@ -52,8 +52,3 @@ def test_versions_grow_with_the_commits_and_differ_where_the_code_does(tmp_path)
     assert changed.public == second.public or changed > second
     assert changed not in (first, second)
     assert changed == version_of(checkout)  # pip asks twice for one build, and refuses a wheel of another version
-    git(checkout, "checkout", "file")
-    git(checkout, "tag", "v0.1.0")
-    assert version_of(checkout) == Version("0.1.0")
-    commit(checkout, "three")
-    assert Version("0.1.0") < version_of(checkout) < Version("0.1.1")

@@ -1,19 +1,10 @@
 """The generated pages of docs/reference are those that the code gives today; the hand-written tables are whole."""
 
 import re
-from collections.abc import Mapping, Sequence
-from typing import Any, Unpack, get_type_hints
 
-import pytest
-
-import dreamfleet
 from deploy import reference
-from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.cli.global_config import TABLES
 from dreamfleet.coordinator.addons.metrics.prometheus import collect_metrics
-from dreamfleet.coordinator.settings import run_setup
-from dreamfleet.experiments.run_arguments import RunArguments
-from dreamfleet.experiments.started_run import setting_names
 from tests.support.samples import STATUS
 
 
@@ -21,17 +12,6 @@ def test_generated_pages_and_the_types_of_a_runs_settings_are_up_to_date():
     for name, text in reference.pages().items():
         assert (reference.FOLDER / name).read_text() == text, "run `make reference`"
     assert reference.RUN_ARGUMENTS.read_text() == reference.run_arguments(), "run `make reference`"
-
-
-@pytest.mark.parametrize("function", [dreamfleet.start_run, dreamfleet.evolve])
-def test_what_starts_a_run_takes_typed_settings(function):
-    assert get_type_hints(function)["settings"] == Unpack[RunArguments]
-    types = get_type_hints(RunArguments)
-    flags = setting_names(build_parser("coordinator", run_setup))
-    assert types.keys() == {*flags}
-    assert types["generations"] == int | None
-    assert types["racing"] == bool | None
-    assert types["environment"] == Mapping[str, Any] | Sequence[str] | None
 
 
 def test_every_table_of_the_configuration_file_is_described_and_each_unit_is_of_a_setting():

@@ -7,7 +7,7 @@ import pytest
 
 from dreamfleet.common.client.eta import Rest, estimate_eta
 from dreamfleet.common.client.run_view import LiveRunView
-from dreamfleet.common.client.status import EpisodeProgress, FailureStatus, GenerationStatus, Throughput, WorkerCount
+from dreamfleet.common.client.status import EpisodeProgress, FailureStatus, GenerationStatus, Throughput
 from dreamfleet.common.printable import format_duration
 from tests.support.samples import BEST, CLOSED, STATUS
 
@@ -139,7 +139,6 @@ def test_without_a_number_a_generation_or_a_worker_there_is_no_estimate():
         ({"state": "evaluating", "evaluating": EpisodeProgress(3, 16)}, "3 of 16 episodes"),
         ({"state": "evaluating", "confirming": EpisodeProgress(3, 1600)}, "3 of 1,600 episodes"),
         ({"state": "waiting for workers"}, "waiting for workers"),
-        ({"state": "waiting for workers", "workers": WorkerCount(0, 0, 0), "steps": 0}, "waiting for workers"),
         ({"state": "waiting for workers", "worker_list": (LEFT,)}, f"{LEFT.worker} .*0.3 s .*no memory"),
         ({"state": "waiting for workers", "refused": {"old-host": "no AVX2"}}, "old-host .*no AVX2"),
         ({"state": "left"}, "--resume night"),

@@ -12,18 +12,12 @@ from dreamfleet.common.files.atomic_write import check_output_path, open_output
 NOBODY = 65534
 
 
-def test_an_impossible_path_is_an_error_before_the_work(tmp_path):
-    (tmp_path / "file").touch()
-    for path in (tmp_path, tmp_path / "file" / "tiny.json"):
-        with pytest.raises(UsageError, match="--out"):
-            check_output_path(path)
-
-
-def test_devices_and_pipes_are_not_replaced(tmp_path):
+def test_an_impossible_path_is_an_error_before_the_work_and_devices_and_pipes_are_not_replaced(tmp_path):
     pipe, link = tmp_path / "pipe", tmp_path / "link"
     os.mkfifo(pipe)
     link.symlink_to(pipe)
-    for path in (pipe, link):
+    (tmp_path / "file").touch()
+    for path in (tmp_path, tmp_path / "file" / "tiny.json", pipe, link):
         with pytest.raises(UsageError, match="--out"):
             check_output_path(path)
         with pytest.raises(DreamfleetError, match=re.escape(str(path))), open_output(path):
