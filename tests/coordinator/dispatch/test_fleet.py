@@ -523,7 +523,7 @@ def test_a_worker_that_did_not_hear_the_answer_to_its_hello_is_given_work_at_onc
     assert not fleet.members[A].unconfirmed
 
 
-def test_a_hello_in_the_name_of_a_live_worker_takes_nothing_from_it():
+def test_a_hello_in_the_name_of_a_live_worker_takes_nothing_from_it_and_a_quiet_one_is_welcomed_anew():
     fleet = fleet_of(A, jobs=4)
     (lost,) = fleet.dispatch(0.0)
     held, numbering = dict(fleet.members[A].leases), fleet.members[A].numbering
@@ -534,13 +534,7 @@ def test_a_hello_in_the_name_of_a_live_worker_takes_nothing_from_it():
     assert (again.numbering, again.number) == (numbering, lost.number), "if it was itself, it may have missed this"
     fleet.add_worker(A, 1, "f", 1.2)
     assert not numbered(fleet.dispatch(1.2)), "which is sent once, however often somebody greets"
-
-
-def test_a_worker_that_said_nothing_for_a_while_is_welcomed_anew():
-    fleet = fleet_of(A, jobs=4)
-    fleet.dispatch(0.0)
-    before = fleet.members[A].numbering
-    assert fleet.add_worker(A, 1, "f", 2.5) > before
+    assert fleet.add_worker(A, 1, "f", 2.5) > numbering
     assert not fleet.members[A].leases
 
 

@@ -77,11 +77,13 @@ def test_an_unknown_verb_and_one_for_several_runs_change_nothing(bench):
     assert (wild.accepted, wild.again, bench.stopped) == (False, "", False)
 
 
-def test_a_drained_run_stops_once_no_worker_holds_a_job(bench):
+def test_a_drained_run_stops_once_no_worker_holds_a_job_and_bars_nobody(bench):
     bench.run.fleet.dispatch(bench.now)
     bench.obey("drain")
     bench.control.advance(bench.now)
     assert not bench.stopped
+    assert bench.obey("bar", "a").why
+    assert not bench.run.admission.barred
     for name in (A, B):
         bench.run.fleet.remove_worker(name)
     bench.control.advance(bench.now)
@@ -121,10 +123,3 @@ def test_the_operator_bars_a_host_and_lets_it_in_again_and_a_misspelt_one_change
     bench.run.commit()
     bench.restart()
     assert bench.run.admission.find_refusal(bench.request(A)) is None
-
-
-def test_a_coordinator_that_leaves_bars_nobody(bench):
-    bench.run.fleet.dispatch(bench.now)
-    bench.obey("drain")
-    assert bench.obey("bar", "a").why
-    assert not bench.run.admission.barred

@@ -37,16 +37,13 @@ def keep(folder, facts):
     journal.close()
 
 
-def test_limits_and_network_come_back_as_they_were(folder):
+def test_limits_and_network_come_back_as_they_were_and_defaults_are_not_written(folder):
+    assert serving_facts(LimitsConfig(), NetworkConfig()) == {"limits": "{}", "network": "{}"}
     limits, network = LimitsConfig(minutes=30.0, target=900.0), NetworkConfig((HERE,), (), 0.2, strict=True)
     keep(folder, serving_facts(limits, network))
     with RunFolder(folder) as run:
         assert LimitsConfig(**stored_limits(run)) == limits
         assert NetworkConfig(**stored_network(run)) == network
-
-
-def test_defaults_are_not_written():
-    assert serving_facts(LimitsConfig(), NetworkConfig()) == {"limits": "{}", "network": "{}"}
 
 
 @pytest.mark.parametrize("text", ["not JSON", "[]", '{"minutes": "many"}', json.dumps({"patience": 3})])

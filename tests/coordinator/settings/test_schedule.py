@@ -49,21 +49,17 @@ def settings(read, random_bundle):
     return lambda text, **flags: freeze(RunConfig(stages=read(text), **flags), random_bundle)
 
 
-def test_the_first_stage_is_what_the_run_begins_as(settings):
+def test_the_first_stage_is_what_the_run_begins_as_also_where_it_is_configured_again(settings, random_bundle):
     found = settings(WHOLE, population=10, horizon=700, seed=5)
     assert (found.population, found.task.horizon, found.task.patience, found.sigma0) == (32, 400, 60, 0.05)
     assert found.stages == (StageSettings(60, 3_000_000, 880.0), StageSettings(horizon=1000, episodes=16, racing=True))
     assert [each.settings.task.horizon for each in stages_of(found)] == [400, 1000]
+    assert comes_back(found, random_bundle)
 
 
 def test_what_the_first_stage_does_not_name_is_as_the_flags_say(settings):
     found = settings("[[stage]]\nsteps = 5\n[[stage]]\nhorizon = 9\n", horizon=70, population=10)
     assert [(each.settings.task.horizon, each.settings.population) for each in stages_of(found)] == [(70, 10), (9, 10)]
-
-
-def test_a_schedule_is_journalled_and_can_be_configured_again(settings, random_bundle):
-    found = settings(WHOLE)
-    assert comes_back(found, random_bundle)
 
 
 def test_one_stage_without_an_end_is_a_run_without_a_schedule(settings, random_bundle):
