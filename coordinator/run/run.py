@@ -274,6 +274,7 @@ class Run:
         If it is not, nothing of it was written, nor what came since the last commit. What the run holds in memory is
         true no more in either case: another life goes on from the journal.
         """
+        self.journal.verify(self.journal.path.parent)  # else what somebody wrote into it would be replayed, and sealed
         self._enter(self.state.rewind())
         before = [*self.fleet.notes]
         try:

@@ -112,10 +112,15 @@ class Journal(JournalConnection):
 
     @classmethod
     def open_verified(cls, folder: Path) -> Journal:
-        """The journal of a run that this process locked, once it was compared with its checksums."""
+        """The journal of a run that this process locked, once it is verified; a damaged one is not written to."""
+        cls.verify(folder)
+        return cls(folder / JOURNAL)
+
+    @staticmethod
+    def verify(folder: Path) -> None:
+        """Compare all that is committed with its checksums; `DamagedJournalError` if anything differs."""
         with RunFolder(folder) as stored:
             stored.verify()
-        return cls(folder / JOURNAL)
 
     @staticmethod
     def check_absent(folder: Path) -> None:

@@ -271,7 +271,7 @@ class MemoryJournal:
     def _ignored(self, *_: object, **__: object) -> None:
         """No rule hangs on it, and nobody else locks or reads the simulated folder."""
 
-    close = set_patience = take_lock = set_seconds = add_event = end_incarnation = _ignored
+    verify = close = set_patience = take_lock = set_seconds = add_event = end_incarnation = _ignored
 
     def commit(self) -> None:
         self.tables.commit()

@@ -1,5 +1,6 @@
 """A run that is taken back to an earlier generation, in a real journal and with real optimisers."""
 
+import sqlite3
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -322,6 +323,16 @@ def test_a_bar_that_is_killed_leaves_a_run_without_a_controller_or_all_of_the_re
         assert run.checks is None
     bar_stored(bench.path, "a", is_barred=True)
     assert not (bench.path / CONTROLLER).exists()
+
+
+def test_a_run_that_is_served_is_not_rewound_by_what_somebody_wrote_into_its_journal(ended):
+    bench = ended()
+    with closing(sqlite3.connect(bench.path / JOURNAL)) as other, other:
+        other.execute("UPDATE result SET fitness = 123 WHERE kind = 'score' AND generation = 0 AND candidate = 0")
+    with pytest.raises(DamagedJournalError):
+        bench.run.bar("a")
+    assert not bench.journal.read("SELECT 1 FROM recalled")
+    bench.journal.close()
 
 
 @pytest.mark.parametrize("refusal", ["damage", "no optimiser"])
