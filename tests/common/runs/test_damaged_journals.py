@@ -14,6 +14,7 @@ import pytest
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.runs.journal.schema import APPLICATION_ID, VERSION
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
+from tests.support.journals import change_journal
 from tests.support.mutations import mutate
 
 RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
@@ -56,11 +57,6 @@ def test_a_killed_coordinators_open_transaction_is_rolled_back(folder, tmp_path)
         assert (run.uid, run.settings) == (own.uid, own.settings)
 
 
-def change(path, statement, *values):
-    with closing(sqlite3.connect(path)) as journal, journal:
-        journal.execute(statement, values)
-
-
 @pytest.mark.slow
 def test_damaged_pages(folder, watched):
     path = folder / "journal.sqlite"
@@ -97,20 +93,20 @@ def test_values_of_other_types(folder, watched):
         for column in columns:
             for value in VALUES:
                 path.write_bytes(whole)
-                change(path, f"UPDATE {table} SET {column} = ?", value)
+                change_journal(folder, f"UPDATE {table} SET {column} = ?", value)
                 watched.read(JournalError, look, folder)
 
 
 @pytest.mark.parametrize("table", ["run", "generation", "candidate", "evaluation", "result", "strategy"])
 def test_missing_tables(folder, watched, table):
-    change(folder / "journal.sqlite", f"DROP TABLE {table}")
+    change_journal(folder, f"DROP TABLE {table}")
     assert not watched.read(JournalError, look, folder)
 
 
 def test_a_query_that_never_ends_is_not_run(folder):
     endless = "WITH RECURSIVE n(key, value) AS (SELECT 1, 1 UNION ALL SELECT key + 1, 2 FROM n) SELECT * FROM n"
     for statement in ("DROP TABLE run", f"CREATE VIEW run AS {endless}"):
-        change(folder / "journal.sqlite", statement)
+        change_journal(folder, statement)
     with pytest.raises(JournalError):
         look(folder)
 
@@ -129,10 +125,10 @@ def test_a_score_of_no_episodes_and_settings_with_an_unknown_field_are_refused(f
     with RunFolder(folder) as run:
         known = json.loads(run.settings.to_json())
     score = {"generation": 1, "episodes": 0, "mean": 1.0, "std": 1.0, "closed": 9}
-    change(folder / "journal.sqlite", set_fact, "confirmed", json.dumps(score))
+    change_journal(folder, set_fact, "confirmed", json.dumps(score))
     with RunFolder(folder) as run, pytest.raises(JournalError):
         run.confirmation()
-    change(folder / "journal.sqlite", set_fact, "settings", json.dumps({**known, "of_tomorrow": 1}))
+    change_journal(folder, set_fact, "settings", json.dumps({**known, "of_tomorrow": 1}))
     with RunFolder(folder) as run, pytest.raises(JournalError):
         run.settings  # noqa: B018
 

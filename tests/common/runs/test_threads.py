@@ -16,6 +16,7 @@ from dreamfleet.common.errors import DamagedJournalError, JournalError, NotWrita
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.coordinator.storage.journal_file import journal_errors
+from tests.support.journals import change_journal
 
 RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
 THREADS = 4
@@ -63,8 +64,7 @@ def test_threads_read_a_run_that_another_one_opened(folder):
 def test_a_transaction_is_its_threads_own(folder):
     with RunFolder(folder) as run, run.read_transaction():
         before = run.uid
-        with closing(sqlite3.connect(folder / "journal.sqlite")) as other, other:
-            other.execute("UPDATE run SET value = 'another' WHERE key = 'uid'")
+        change_journal(folder, "UPDATE run SET value = 'another' WHERE key = 'uid'")
         assert run.uid == before
         assert in_thread(lambda: run.uid) == "another"
         assert run.uid == before
@@ -123,8 +123,7 @@ def test_pages_that_sqlite_cannot_read_are_damage(folder):
 
 
 def test_text_of_other_bytes_is_damage(folder):
-    with closing(sqlite3.connect(folder / "journal.sqlite")) as other, other:
-        other.execute("UPDATE run SET value = CAST(x'ff' AS TEXT) WHERE key = 'uid'")
+    change_journal(folder, "UPDATE run SET value = CAST(x'ff' AS TEXT) WHERE key = 'uid'")
     with RunFolder(folder) as run, pytest.raises(DamagedJournalError):
         run.uid  # noqa: B018
     with closing(Journal(folder / "journal.sqlite")) as journal, pytest.raises(DamagedJournalError):

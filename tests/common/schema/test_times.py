@@ -1,6 +1,4 @@
 import shutil
-import sqlite3
-from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -8,6 +6,7 @@ import pytest
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.schema.times import elapsed_seconds, format_time
+from tests.support.journals import change_journal
 
 RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
 ENDED = "2026-01-01T00:00:00+00:00"
@@ -32,11 +31,10 @@ def test_a_moment_for_people():
 @pytest.mark.parametrize("begun", [None, "", "x", "1970-01-01T00:00:00", "9999-12-31T23:59:59-23:00"])
 def test_every_verb_about_a_run_reads_its_odd_times(begun, tmp_path, capsys):
     runs = shutil.copytree(RUNS, tmp_path / "runs")
-    with closing(sqlite3.connect(runs / "reality" / "journal.sqlite")) as journal, journal:
-        journal.execute("INSERT OR REPLACE INTO run VALUES ('ended_at', ?)", (ENDED,))
-        journal.execute("DELETE FROM run WHERE key = 'created'")
-        if begun is not None:
-            journal.execute("INSERT INTO run VALUES ('created', ?)", (begun,))
+    change_journal(runs / "reality", "INSERT OR REPLACE INTO run VALUES ('ended_at', ?)", ENDED)
+    change_journal(runs / "reality", "DELETE FROM run WHERE key = 'created'")
+    if begun is not None:
+        change_journal(runs / "reality", "INSERT INTO run VALUES ('created', ?)", begun)
     known = begun == "1970-01-01T00:00:00"
     with RunFolder(runs / "reality") as run:
         assert (run.duration_seconds is not None) == known
