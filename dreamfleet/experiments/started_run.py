@@ -112,7 +112,8 @@ class StartedRun(StoredRun):
             if over:
                 break
             if self._is_live:  # else the loop's body has ended it
-                self._processes.check_workers()
+                if self.ended is None:  # else a busy host may kill a worker that takes long to exit
+                    self._processes.check_workers()
                 self._check_pause()
                 time.sleep(POLL_INTERVAL)
         if self._is_live:

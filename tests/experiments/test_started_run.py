@@ -2,11 +2,13 @@
 Tests run_arguments.py."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import uuid
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -14,7 +16,15 @@ import pytest
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
 from dreamfleet.coordinator.addons.runs.stored_run import open_run
-from dreamfleet.experiments.started_run import RunPausedError, _claim, _free_name, check_settings, evolve, start_run
+from dreamfleet.experiments.started_run import (
+    RunPausedError,
+    StartedRun,
+    _claim,
+    _free_name,
+    check_settings,
+    evolve,
+    start_run,
+)
 from tests.support.processes import DEADLINE, ROOT, environment, until
 from tests.support.tasks import RAISING
 
@@ -122,6 +132,30 @@ def test_a_worker_that_dies_is_named_and_so_is_a_stop_from_elsewhere(alive, tmp_
         with pytest.raises(StoppedError, match="pole"):
             run.wait()
     assert not alive()
+
+
+class Leaving:
+    """The processes of a run that has ended: the coordinator exits, and its worker did not do so in time."""
+
+    def __init__(self):
+        self.codes = iter((None, 0))
+
+    @property
+    def coordinator(self):
+        return SimpleNamespace(exit_code=next(self.codes))
+
+    def check_workers(self):
+        raise DreamfleetError("killed by signal 14")
+
+    def check_end(self):
+        pass
+
+
+def test_a_worker_that_is_killed_as_it_leaves_an_ended_run_is_no_error(tmp_path):
+    shutil.copytree(ROOT / "tests" / "fixtures" / "runs" / "reality", tmp_path / "reality")
+    with StartedRun(tmp_path / "reality", Leaving(), "", None, resumed=False) as run:
+        run.end_with(ExitStack())
+        assert [each.number for each in run] == [0, 1, 2]
 
 
 @pytest.mark.slow

@@ -42,7 +42,7 @@ def failure_of(error: BaseException) -> Failure:
     text = _text(error) if isinstance(error, DreamfleetError) else f"{name}: {_text(error)}"
     if is_hosts_fault(error):
         return Failure.of_host(encodable(text[:MAX_TEXT]))
-    return Failure(encodable(text[:MAX_TEXT]), name, "usage" if isinstance(error, UsageError) else "other")
+    return Failure(encodable(text[:MAX_TEXT]), name, kind="usage" if isinstance(error, UsageError) else "other")
 
 
 def describe_exit(status: int) -> str:
@@ -60,7 +60,7 @@ def crash(reason: int | str) -> Failure:
     if isinstance(reason, int) and is_hosts_fault(reason):
         return Failure.of_host(f"{describe_exit(reason)}, as the kernel does when memory is short")
     words = reason if isinstance(reason, str) else describe_exit(reason)
-    return Failure(f"slot crashed ({words})", words[:MAX_CAUSE], "crash")
+    return Failure(f"slot crashed ({words})", words[:MAX_CAUSE], kind="crash")
 
 
 def encodable(text: str) -> str:
