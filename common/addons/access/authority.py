@@ -103,9 +103,9 @@ class Authority:
         days, now = DEFAULT_DAYS[role] if days is None else days, now or datetime.now(UTC)
         expires = (now + timedelta(days=days)).replace(microsecond=0)
         check_output_path(out)
-        if out.exists():
-            raise UsageError(f"{out} exists: name another --out")
         with self._locked_ledger() as ledger:
+            if out.exists():
+                raise UsageError(f"{out} exists: name another --out")
             seat, shared = _assign_seat(ledger, role, name), {"ca": self._pem, "connect": tuple(connect)}
             who = Credentials(role, seat, name, min(expires, self._certificate.not_valid_after_utc), **shared)  # type: ignore[arg-type]
             serial = x509.random_serial_number()

@@ -305,7 +305,10 @@ def test_a_list_keeps_what_is_valid_or_revoked_or_a_names_last_and_never_grows_t
 def test_commands_at_once_wait_for_each_other(access, tmp_path):
     with ThreadPoolExecutor(8) as pool:
         issued = list(pool.map(lambda n: access.issue("worker", f"w{n}", tmp_path / f"{n}", connect=HERE), range(8)))
+        again = [pool.submit(access.issue, "worker", f"w{n}", tmp_path / "one", connect=HERE) for n in range(8)]
     assert len({each.seat for each in issued}) == 8
+    failures = [type(each.exception()) for each in again if each.exception()]
+    assert failures == [UsageError] * 7, "a file is written once"
 
 
 def test_an_existing_authority_is_not_overwritten_even_in_a_race(tmp_path, monkeypatch):
