@@ -22,7 +22,7 @@ from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, PolicyStep
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
-from tests.support.bundles import npy
+from tests.support.bundles import npy, parts_of
 from tests.support.drives import ignore, train_models, write_drives
 from tests.support.models import random_models, weights
 
@@ -36,10 +36,6 @@ WHOLE = {INITIAL_LATENTS_PART: np.zeros((4, 2, 32), np.float32), RECORDED_STATES
 def damaged(whole):
     """An array's content spoilt."""
     return [whole + np.nan, whole + np.inf, whole.astype(np.int64), np.array([object()]), npy(whole)[:-1], b""]
-
-
-def parts_of(bundle):
-    return {name: bundle.read(name) for name in bundle.manifest.parts}
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

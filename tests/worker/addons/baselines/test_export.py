@@ -1,5 +1,5 @@
 """An exported agent drives like the trained network, without torch; any other file is refused.
-Tests common/artifacts/trained_agent.py."""
+Tests common/artifacts/trained_agent.py and worker/worlds/car_racing/agents.py."""
 
 import hashlib
 import json
@@ -8,6 +8,7 @@ import subprocess
 import sys
 import zipfile
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,10 +26,13 @@ from dreamfleet.worker.addons.baselines.train import CHECKPOINT, train_drqn
 from dreamfleet.worker.addons.evaluation import evaluation
 from dreamfleet.worker.addons.evaluation.agents import make_agent
 from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
+from dreamfleet.worker.addons.evaluation.named_agents import find_driver
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.policy import NO_PARAMETERS
 from dreamfleet.worker.training.checkpoint import save_checkpoint
 from dreamfleet.worker.worldmodel.inference import open_graph
+from dreamfleet.worker.worldmodel.vae import VAE
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from dreamfleet.worker.worlds.car_racing.agents import NetworkPolicy
 from dreamfleet.worker.worlds.car_racing.native_check import make_car_racing
 
@@ -123,14 +127,14 @@ def test_a_file_describes_its_training_and_is_reproducible(tmp_path, capsys):
 
 
 def test_a_training_and_its_file_give_the_same_report_and_compare_takes_both(trained, file, tmp_path, capsys):
-    drives = ["--episodes", "3", "--first-seed", str(SEED), "--out"]
-    one, other = str(tmp_path / "one.json"), str(tmp_path / "other.json")
-    assert main(["evaluate", "--controller", str(file), "--jobs", "1", *drives, one]) == 0
-    assert main(["evaluate", "--controller", str(trained), "--jobs", "1", *drives, other]) == 0
-    found = [read_evaluation_report(tmp_path / name) for name in ("one.json", "other.json")]
+    one, other = (str(tmp_path / name) for name in ("one.json", "other.json"))
+    for who, out in ((file, one), (trained, other)):
+        drives = ["--episodes", "3", "--first-seed", str(SEED), "--jobs", "1", "--out", out]
+        assert main(["evaluate", "--controller", str(who), *drives]) == 0
+    found = [read_evaluation_report(Path(out)) for out in (one, other)]
     assert replace(found[0], name="", seconds=0) == replace(found[1], name="", seconds=0)
     assert {each.steps for each in found[0].drives} == {STEPS}
-    assert all(each.speed is not None for each in found[0].drives)
+    assert all(each.speed is not None and each.braking is not None for each in found[0].drives)
     assert "torch" not in found[0].fingerprint
     capsys.readouterr()
     assert main(["compare", one, other, "--json"]) == 0
@@ -180,28 +184,18 @@ def rewritten(file, change=lambda about: about, network=None):
 @pytest.mark.parametrize(
     "change",
     [
-        lambda _about: [],
-        lambda about: about | {"format": 9},
-        lambda about: about | {"network": "ab" * 32},
-        lambda about: about | {"frame_skip": 0},
-        lambda about: about | {"frame_skip": True},
-        lambda about: about | {"state": 10**9},
-        lambda about: about | {"choices": []},
-        lambda about: about | {"choices": [[float("nan"), 0, 0]] * 5},
-        lambda about: {name: value for name, value in about.items() if name != "choices"},
-        lambda about: about | {"more": 1},
-        lambda about: about | {"choices": [[1e9, 0, 0]] * 5},
-        lambda about: about | {"choices": [[0, 0]] * 5},
-        lambda about: about | {"choices": [[0, 0, 0]] * 4},
-        lambda about: about | {"state": 4},
-        lambda about: about | {"preprocessing": "raw-96"},
-        lambda about: about | {"preprocessing": "sharp-7"},
-        lambda about: about | {"task": "moon"},
+        {"format": 9}, {"network": "ab" * 32}, {"frame_skip": 0}, {"frame_skip": True}, {"state": 10**9},
+        {"state": 4}, {"choices": []}, {"choices": [[float("nan"), 0, 0]] * 5}, {"choices": [[1e9, 0, 0]] * 5},
+        {"choices": [[0, 0]] * 5}, {"choices": [[0, 0, 0]] * 4}, {"choices": None}, {"more": 1},
+        {"preprocessing": "raw-96"}, {"preprocessing": "sharp-7"}, {"task": "moon"}, None,
     ],
-)
+)  # fmt: skip
 def test_a_wrong_manifest_is_one_line(file, tmp_path, change):
+    def changed(about):
+        return [] if change is None else {name: each for name, each in (about | change).items() if each is not None}
+
     with pytest.raises(ControllerError) as caught:
-        make_agent(find_agent(str(rewritten(file, change)), tmp_path)[0])
+        make_agent(find_agent(str(rewritten(file, changed)), tmp_path)[0])
     assert "\n" not in str(caught.value)
 
 
@@ -219,17 +213,14 @@ def test_a_wrong_network_is_one_line(file, tmp_path, random_bundle):
 
 def test_what_is_no_whole_file_is_one_line(file, tmp_path, capsys):
     whole = file.read_bytes()
-    for content in (b"", whole[:-30], whole[: len(whole) // 2], b"\0" * 100):
+    half = len(whole) // 2
+    flipped = whole[:half] + bytes([whole[half] ^ 1]) + whole[half + 1 :]
+    for content in (b"", whole[:-30], whole[:half], b"\0" * 100, flipped):
         file.write_bytes(content)
         assert main(["evaluate", "--controller", str(file), "--episodes", "1"]) == 1
         assert len(capsys.readouterr().err.splitlines()) == 1
     with pytest.raises(ControllerError):
         TrainedAgent.load(tmp_path)
-    flipped = bytearray(whole)
-    flipped[len(whole) // 2] ^= 1
-    file.write_bytes(flipped)
-    with pytest.raises(ControllerError):
-        find_agent(str(file), tmp_path)
 
 
 def test_a_network_that_gives_nan_ends_the_drive(file):
@@ -240,7 +231,17 @@ def test_a_network_that_gives_nan_ends_the_drive(file):
         policy.choose(np.zeros((64, 64, 3), np.uint8))
 
 
-def test_what_cannot_be_exported_is_one_line(trained, tmp_path, capsys):
+def test_a_folder_without_a_sound_training_has_no_agent(trained, tmp_path):
+    with pytest.raises(ControllerError):
+        find_driver(str(tmp_path / "absent"), tmp_path)
+    path, other = trained / CHECKPOINT, keep(tmp_path / "vae", VAE(VAEConfig(latent=4, channels=(2, 2, 4, 4))))
+    path.write_bytes(path.read_bytes()[:-50])
+    for folder in (trained, other):
+        with pytest.raises(DatasetError, match=r"drqn\.safetensors"):
+            find_driver(str(folder), tmp_path)
+
+
+def test_what_cannot_be_exported_is_one_line(tmp_path, capsys):
     assert main(["baseline", "export", "random", "--data", str(tmp_path), "--out", str(tmp_path / "a.zip")]) == 2
     assert "random" in capsys.readouterr().err
     networks = networks_of(LAYERS)

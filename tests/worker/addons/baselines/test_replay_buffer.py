@@ -59,8 +59,8 @@ def test_choices_and_returns_stand_beside_their_pictures(replay):
 def test_the_oldest_episodes_leave_and_the_last_one_stays():
     replay = ReplayBuffer(LearningConfig(replay=10))
     lengths = (4, 4, 4, 30)
-    for count, (number, length) in enumerate(enumerate(lengths), 1):
-        replay.add(episode(number, length))
+    for count, length in enumerate(lengths, 1):
+        replay.add(episode(count, length))
         assert len(replay) == count - first_in_replay(list(lengths[:count]), 10)
     assert [first_in_replay(list(lengths[:count]), 10) for count in range(5)] == [0, 0, 0, 1, 3]
 
@@ -77,13 +77,9 @@ def test_rows_beyond_an_episode_are_zero():
     assert slice_padded(np.array([1, 2, 3]), 5, 7).tolist() == [0, 0]
 
 
-def test_rewards_of_n_decisions_are_added_up_and_discounted():
+def test_rewards_of_n_decisions_are_added_up_and_what_a_cut_episode_hides_is_not_learnt():
     returns = n_step(np.array(REWARDS), terminal=True, gamma=0.5, n=2)
     assert returns.value.tolist() == [1 + 1, 2 + 2, 4 + 4, 8]
     assert returns.discount.tolist() == [0.25, 0.25, 0, 0]
-
-
-def test_what_a_cut_episode_hides_is_not_learnt():
-    returns = n_step(np.array(REWARDS), terminal=False, gamma=0.5, n=2)
-    assert returns.known.tolist() == [True, True, False, False]
+    assert n_step(np.array(REWARDS), terminal=False, gamma=0.5, n=2).known.tolist() == [True, True, False, False]
     assert not n_step(np.array(REWARDS[:1]), terminal=False, gamma=0.5, n=2).known.any()

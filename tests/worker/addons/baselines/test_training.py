@@ -2,8 +2,8 @@
 Tests presets.py, progress.py, train.py and verb.py."""
 
 import json
-import resource
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,6 +17,7 @@ from dreamfleet.worker.addons.baselines.presets import LEARNING, NOTEBOOK, Agent
 from dreamfleet.worker.addons.baselines.train import CHECKPOINT, CURVE, episode_file, train_drqn
 from dreamfleet.worker.tasks.policy import NO_PARAMETERS
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights, save_checkpoint
+from tests.support.disks import file_size_limit
 from tests.support.verbs import run_verb
 
 LAYERS = AgentConfig(channels=(2,), kernels=(8,), strides=(8,), hidden=4, frame_skip=3)
@@ -82,7 +83,7 @@ def test_a_kill_at_any_checkpoint_leads_to_the_same_files(whole, tmp_path, monke
 
     for number in range(1, 7):
         writes.clear()
-        monkeypatch.setattr(train, "save_checkpoint", lambda *given, number=number: killed_at(number, *given))
+        monkeypatch.setattr(train, "save_checkpoint", partial(killed_at, number))
         folder = tmp_path / str(number)
         with pytest.raises(KilledError):
             train_drqn(folder, LAYERS, SHORT)
@@ -177,39 +178,28 @@ def test_a_second_training_in_a_folder_is_refused_while_the_first_one_runs(tmp_p
 
 
 def test_a_full_disk_is_one_line_and_the_last_checkpoint_stays(whole, tmp_path):
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-
-    def fill(done, _report):
-        if done == 3:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
-
-    try:
-        with pytest.raises(DatasetError, match=r"000003\.npz"):
-            train_drqn(tmp_path, LAYERS, SHORT, fill)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with file_size_limit() as limit, pytest.raises(DatasetError, match=r"000003\.npz"):
+        train_drqn(tmp_path, LAYERS, SHORT, lambda done, _: limit(2000) if done == 3 else None)
     train_drqn(tmp_path, LAYERS, SHORT)
     assert state(tmp_path) == state(whole[0])
 
 
 @pytest.mark.parametrize(
-    "change",
-    [{"picture": 80}, {"kernels": (3, 3)}, {"kernels": (65,)}, {"frame_skip": 0}, {"frame_skip": 10**9},
-     {"hidden": 10**9}],
+    ("settings", "change"),
+    [
+        *((LAYERS, each) for each in (
+            {"picture": 80}, {"kernels": (3, 3)}, {"kernels": (65,)}, {"frame_skip": 0}, {"frame_skip": 10**9},
+            {"hidden": 10**9},
+        )),
+        *((SHORT, each) for each in (
+            {"batch": 0}, {"batch": 10**9}, {"burn_in": -1}, {"gamma": 1.5}, {"rate": 0.0}, {"rate": float("inf")},
+            {"clip": float("nan")}, {"goal": float("nan")}, {"seed": 10**20}, {"n_step": 10**9},
+        )),
+    ],
 )  # fmt: skip
-def test_an_impossible_agent_is_refused(change):
+def test_impossible_settings_are_refused(settings, change):
     with pytest.raises(UsageError):
-        replace(LAYERS, **change)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"batch": 0}, {"burn_in": -1}, {"gamma": 1.5}, {"rate": 0.0}, {"clip": float("nan")}, {"goal": float("nan")},
-     {"rate": float("inf")}, {"seed": 10**20}, {"batch": 10**9}, {"n_step": 10**9}],
-)  # fmt: skip
-def test_impossible_learning_is_refused(change):
-    with pytest.raises(UsageError):
-        replace(SHORT, **change)
+        replace(settings, **change)
 
 
 def test_a_memory_goes_through_time_as_along_a_trace():

@@ -1,9 +1,14 @@
-"""The peers of `lab bench dispatch`: whatever they do, the benchmark ends. Tests simulated_workers.py."""
+"""The peers of `lab bench dispatch`: whatever they do, the benchmark ends.
+Tests simulated_workers.py and sleep_tasks.py."""
 
 import time
 from contextlib import contextmanager
 
+import pytest
+
 from dreamfleet.worker.addons.bench import dispatch
+from dreamfleet.worker.addons.bench.sleep_tasks import HALF_SECOND_TASK, NULL_TASK, SLEEP_TASK
+from dreamfleet.worker.tasks.registry import find_task
 
 
 @contextmanager
@@ -30,3 +35,8 @@ def test_a_peer_that_hangs_or_fails_has_no_figures(monkeypatch):
     assert dispatch.run_peer(failing) is None
     monkeypatch.setattr(dispatch, "PEER_SECONDS", 1.0)
     assert dispatch.run_peer(hanging) is None
+
+
+@pytest.mark.parametrize("name", [SLEEP_TASK, NULL_TASK, HALF_SECOND_TASK])
+def test_a_worker_finds_its_tasks_by_name(name):
+    assert find_task(name).name == name

@@ -36,8 +36,7 @@ def test_a_floor_is_each_product_by_the_library_that_is_fastest_at_it():
 
 def test_numpy_and_the_runtime_are_always_asked():
     cases = product_cases([((3, 4), (4, 5)), ((2, 3, 4), (2, 4, 1))])
-    for index in range(2):
-        assert {f"product {index} by numpy", f"product {index} by onnxruntime"} <= cases.keys()
+    assert {f"product {index} by {name}" for index in (0, 1) for name in ("numpy", "onnxruntime")} <= cases.keys()
     assert len(cases) <= 2 * len(LIBRARIES)
     for call in cases.values():
         call()

@@ -24,7 +24,7 @@ from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, PolicySte
 from dreamfleet.worker.worldmodel.mdnrnn_config import ATTENTIVE, MDNRNNConfig
 from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
-from tests.support.bundles import write_random_bundle
+from tests.support.bundles import parts_of, write_random_bundle
 
 EYES = VAEConfig(latent=4, channels=(4, 6, 8, 8))
 MEMORY = MDNRNNConfig(latent=4, hidden=6)
@@ -169,7 +169,7 @@ def wild(whole, path):
     """Its dreams lose their world, so that they give no ranges."""
     weights, numbers = restore_models(whole).mdnrnn, MEMORY.mixtures * MEMORY.latent
     weights["heads.bias"][-2 * numbers :] = 30  # of means and deviations
-    parts = {name: whole.read(name) for name in whole.manifest.parts} | {DREAM_GRAPH: export_dream(weights, MEMORY)}
+    parts = parts_of(whole) | {DREAM_GRAPH: export_dream(weights, MEMORY)}
     return write_bundle(path, replace(whole.manifest, parts={}), parts)
 
 

@@ -18,7 +18,7 @@ from dreamfleet.worker.training.encode import encode, encoder_hash
 from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.worldmodel.mdnrnn_config import ATTENTIVE, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
-from tests.support.bundles import write_random_bundle
+from tests.support.bundles import parts_of, write_random_bundle
 from tests.support.drives import ignore, write_drives
 from tests.support.models import random_models, weights
 
@@ -77,7 +77,7 @@ def test_weights_that_a_bundle_keeps_are_taken_as_they_were(tmp_path):
     trained = random_models(3, replace(EYES, batch_norm=True), MEMORY)
     kept = {f"{name}.{each}": values for name, model in zip(("vae", "mdnrnn"), trained, strict=True)
             for each, values in weights(model).items()}  # fmt: skip
-    parts = {name: plain.read(name) for name in plain.manifest.parts}
+    parts = parts_of(plain)
     whole = write_bundle(tmp_path / "b.zip", plain.manifest, parts | {WEIGHTS: save(kept)})
     unbundle(whole, tmp_path / "kept")
     for model in ("vae", "mdnrnn"):
@@ -104,16 +104,15 @@ def test_weights_that_a_bundle_keeps_are_taken_as_they_were(tmp_path):
 def test_models_that_cannot_be_restored_are_refused(plain, tmp_path, eyes, memory):
     """The manifest of one bundle with the graphs of another."""
     other = write_random_bundle(tmp_path / "b.zip", 3, eyes, memory)
-    parts = {name: plain.read(name) for name in plain.manifest.parts}
     manifest = replace(plain.manifest, models=other.manifest.models)
     with pytest.raises(BundleError):
-        unbundle(write_bundle(tmp_path / "c.zip", manifest, parts), tmp_path / "data")
+        unbundle(write_bundle(tmp_path / "c.zip", manifest, parts_of(plain)), tmp_path / "data")
     assert not list(tmp_path.glob("data/*"))
 
 
 @pytest.mark.parametrize("part", [ENCODER, DECODER, DREAM_GRAPH])
 def test_a_graph_that_is_none_is_refused_in_a_line(plain, tmp_path, part):
-    parts = {name: plain.read(name) for name in plain.manifest.parts} | {part: b"\0junk" * 100}
+    parts = parts_of(plain) | {part: b"\0junk" * 100}
     with pytest.raises(BundleError):
         unbundle(write_bundle(tmp_path / "b.zip", plain.manifest, parts), tmp_path / "data")
 

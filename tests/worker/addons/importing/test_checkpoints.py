@@ -26,8 +26,10 @@ def imported(tmp_path_factory):
     return folder, weights, Bundle.open(world), Controller.load(controller)
 
 
-def test_a_controller_acts_as_in_their_program(imported):
+def test_a_controller_acts_as_in_their_program_and_sees_whole_pictures(imported):
     _, weights, bundle, controller = imported
+    assert (bundle.manifest.preprocessing, bundle.manifest.picture) == ("whole-64", (64, 64, 3))
+    assert controller.variant.actions == "linear"
     pictures = np.random.default_rng(2).integers(0, 256, (20, 64, 64, 3), dtype=np.uint8)
     wanted = theirs.drive(weights, pictures)
     state, actions = None, []
@@ -88,21 +90,6 @@ def test_a_reward_head_that_was_never_trained_is_left_out(imported, tmp_path):
     assert config.reward == "none"
     with_head, _ = read_mdnrnn(imported[0] / "mdrnn" / "best.tar")
     assert np.array_equal(weights["heads.bias"], np.delete(with_head["heads.bias"], -2))
-
-
-@pytest.mark.slow
-def test_training_goes_on_from_such_a_bundle(imported, tmp_path):
-    from dreamfleet.worker.addons.bundles.unbundle import unbundle
-
-    vae, rnn = unbundle(imported[2], tmp_path)
-    assert vae.exists()
-    assert rnn.exists()
-
-
-def test_the_bundle_sees_whole_pictures(imported):
-    manifest = imported[2].manifest
-    assert (manifest.preprocessing, manifest.picture) == ("whole-64", (64, 64, 3))
-    assert imported[3].variant.actions == "linear"
 
 
 def test_a_part_of_another_shape_is_refused(imported, tmp_path):

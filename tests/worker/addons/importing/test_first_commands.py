@@ -14,44 +14,33 @@ from dreamfleet.common.cli.command_line import main
 from tests.support import checkpoint_files
 from tests.support.foreign_drives import ctallec_drive
 
+WME, ARTICLE, CTALLEC = "log/best.json", "controller/car_racing.cma.4.32.best.json", "exp_dir/ctrl/best.tar"
+DRIVES = ("record", "rollout", "datasets/carracing")
+TRAIN = "train vae --data data --preset paper"
 # What is typed, its exit code, and the command that the answer names, or "" where it is the result.
-FROM_WME = [
-    ("evaluate --controller log/best.json", 1, "import log/best.json --bundle WORLD_MODEL --out controller.npz"),
-    ("record --controller log/best.json --out x.mp4", 1,
-     "import log/best.json --bundle WORLD_MODEL --out controller.npz"),
-    ("coordinator --run x --init log/best.json", 1, "import log/best.json --bundle WORLD_MODEL --out controller.npz"),
-    ("lab refit log/best.json --to tiny --data data --out x.npz", 1,
-     "import log/best.json --bundle WORLD_MODEL --out controller.npz"),
-    ("import log/best.json --out x.npz", 2, "import FOLDER --out world.zip"),
-    ("import log/best.json --bundle world.zip --out x.npz", 0, ""),
-    ("train vae --data record", 1, "import record --out DATA"),
-    ("import record --out data", 0, "train vae --data data --preset paper"),
-]  # fmt: skip
-FROM_THE_ARTICLE = [
-    ("evaluate --controller controller/car_racing.cma.4.32.best.json", 1,
-     "import controller/car_racing.cma.4.32.best.json --bundle WORLD_MODEL --out controller.npz"),
-    ("import controller/car_racing.cma.4.32.best.json --layout article --bundle world.zip --out x.npz", 0, ""),
-    ("train vae --data rollout", 1, "import rollout --out DATA"),
-    ("import rollout --out data", 0, "train vae --data data --preset paper"),
+TYPED = [
+    *((typed.format(source), 1, f"import {source} --bundle WORLD_MODEL --out controller.npz") for source, typed in (
+        *((source, "evaluate --controller {}") for source in (WME, ARTICLE, CTALLEC)),
+        (WME, "record --controller {} --out x.mp4"),
+        (WME, "coordinator --run x --init {}"),
+        (CTALLEC, "coordinator --run x --init {}"),
+        (WME, "lab refit {} --to tiny --data data --out x.npz"),
+    )),
+    *((f"train vae --data {source}", 1, f"import {source} --out DATA") for source in DRIVES),
+    *((f"import {source} --out data", 0, TRAIN) for source in DRIVES),
+    (f"import {WME} --out x.npz", 2, "import FOLDER --out world.zip"),
+    (f"import {WME} --bundle world.zip --out x.npz", 0, ""),
+    (f"import {ARTICLE} --layout article --bundle world.zip --out x.npz", 0, ""),
     ("import vae/weights.h5 --out x.zip", 1, "import DRIVES --out DATA"),
     ("import . --out x.zip", 1, "import DRIVES --out DATA"),
-]  # fmt: skip
-FROM_CTALLEC = [
-    ("evaluate --controller exp_dir/ctrl/best.tar", 1,
-     "import exp_dir/ctrl/best.tar --bundle WORLD_MODEL --out controller.npz"),
-    ("coordinator --run x --init exp_dir/ctrl/best.tar", 1,
-     "import exp_dir/ctrl/best.tar --bundle WORLD_MODEL --out controller.npz"),
     ("evaluate --controller exp_dir", 1, "import exp_dir --out OUT"),
     ("evaluate --controller tiny --bundle exp_dir/vae/best.tar", 1, "import exp_dir --out world.zip"),
-    ("import exp_dir/ctrl/best.tar --out x.npz", 2, "import exp_dir --out world.zip"),
+    (f"import {CTALLEC} --out x.npz", 2, "import exp_dir --out world.zip"),
     ("import exp_dir/vae/best.tar --out x.zip", 1, "import exp_dir --out world.zip"),
     ("coordinator --run x --task dream --bundle exp_dir", 1, "import exp_dir --out world.zip"),
-    ("import exp_dir --out world.zip", 0, "import exp_dir/ctrl/best.tar --bundle world.zip --out controller.npz"),
-    ("import exp_dir/ctrl/best.tar --bundle world.zip --out x.npz", 0,
-     "evaluate --controller x.npz --bundle world.zip"),
+    ("import exp_dir --out world.zip", 0, f"import {CTALLEC} --bundle world.zip --out controller.npz"),
+    (f"import {CTALLEC} --bundle world.zip --out x.npz", 0, "evaluate --controller x.npz --bundle world.zip"),
     ("import exp_dir/ctrl --bundle world.zip --out x.npz", 0, "evaluate --controller x.npz --bundle world.zip"),
-    ("train vae --data datasets/carracing", 1, "import datasets/carracing --out DATA"),
-    ("import datasets/carracing --out data", 0, "train vae --data data --preset paper"),
 ]  # fmt: skip
 
 
@@ -61,7 +50,7 @@ def theirs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("theirs")
     checkpoint_files.write_checkpoints(folder / "exp_dir", checkpoint_files.random_weights())
     assert main(["import", str(folder / "exp_dir"), "--out", str(folder / "world.zip")]) == 0
-    for place in ("log/best.json", "controller/car_racing.cma.4.32.best.json"):
+    for place in (WME, ARTICLE):
         (folder / place).parent.mkdir()
         (folder / place).write_text(json.dumps([np.linspace(-0.2, 0.2, 867).round(4).tolist(), 903.5]))
     pictures = np.zeros((3, 64, 64, 3), np.uint8)
@@ -84,7 +73,7 @@ def theirs(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize(("typed", "code", "named"), [*FROM_WME, *FROM_THE_ARTICLE, *FROM_CTALLEC])
+@pytest.mark.parametrize(("typed", "code", "named"), TYPED)
 def test_a_first_command_ends_in_its_result_or_names_the_command(
     typed, code, named, theirs, tmp_path, monkeypatch, capsys
 ):
@@ -111,10 +100,10 @@ def written_by(name, folder):
     return Bundle.open(path).manifest.latent == 32 if name.endswith(".zip") else any((path / "episodes").iterdir())
 
 
-def test_no_file_of_the_source_is_replaced(theirs, tmp_path, monkeypatch, capsys):
+def test_no_file_of_the_source_is_replaced(theirs, monkeypatch, capsys):
     monkeypatch.chdir(theirs)
     before = (theirs / "exp_dir/vae/best.tar").read_bytes()
     assert main(["import", "exp_dir", "--out", "exp_dir/vae/best.tar"]) == 2
-    assert main(["import", "exp_dir/ctrl/best.tar", "--bundle", "world.zip", "--out", "exp_dir/ctrl/best.tar"]) == 2
-    assert "exp_dir/ctrl/best.tar" in capsys.readouterr().err
+    assert main(["import", CTALLEC, "--bundle", "world.zip", "--out", CTALLEC]) == 2
+    assert CTALLEC in capsys.readouterr().err
     assert (theirs / "exp_dir/vae/best.tar").read_bytes() == before

@@ -18,24 +18,21 @@ from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.worker.addons.importing.drives import read_drive
 from dreamfleet.worker.addons.importing.vectors import read_vector, to_parameters
 from dreamfleet.worker.training.data.dataset import episode_paths, find_world, kind_of, load_pictures, load_steps
+from dreamfleet.worker.worlds.car_racing.preprocessing import BOX
 from tests.support.foreign_drives import ctallec_drive
 from tests.support.samples import SPEC
 
 
-def test_orders():
+def test_orders_of_a_vector_that_fits():
     shape = ControllerShape(features=2, actions=3)
     weights, biases = np.arange(6.0).reshape(3, 2), np.array([7.0, 8, 9])
     wanted = [*weights.ravel(), *biases]
     assert to_parameters(np.array(wanted), "dreamfleet", shape).tolist() == wanted
     assert to_parameters(np.array([*biases, *weights.T.ravel()]), "wme", shape).tolist() == wanted
     assert to_parameters(np.array([*weights.T.ravel(), *biases]), "article", shape).tolist() == wanted
-
-
-def test_a_vector_that_does_not_fit_is_refused():
-    with pytest.raises(ControllerError):
-        to_parameters(np.zeros(5), "wme", ControllerShape(2, 3))
-    with pytest.raises(ControllerError):
-        to_parameters(np.zeros(12), "wme", ControllerShape(2, 2, hidden=2))
+    for wrong, layers in ((np.zeros(5), shape), (np.zeros(12), ControllerShape(2, 2, hidden=2))):
+        with pytest.raises(ControllerError):
+            to_parameters(wrong, "wme", layers)
 
 
 def test_files_of_vectors(tmp_path):
@@ -78,13 +75,6 @@ def test_a_pickled_array_is_not_executed(tmp_path):
         read_vector(tmp_path / "x.npy")
 
 
-def test_a_vector_like_a_controller_that_ships(tmp_path):
-    np.save(tmp_path / "v.npy", np.zeros(867))
-    out = tmp_path / "zeros.npz"
-    assert main(["import", str(tmp_path / "v.npy"), "--like", "tiny", "--out", str(out)]) == 0
-    assert Controller.load(out).bundle == Controller.load(out).bundle != ""
-
-
 @pytest.mark.parametrize("name", ["v.json", "v.npy"])
 @pytest.mark.parametrize("optimiser", ["external", "cma"])
 def test_a_vector_like_a_run_lies_as_the_runs_own_and_needs_no_torch(name, optimiser, tmp_path, monkeypatch):
@@ -105,31 +95,41 @@ def test_a_vector_like_a_run_lies_as_the_runs_own_and_needs_no_torch(name, optim
     assert Controller.load(tmp_path / "best.npz").parameters.tolist() == [2, 4, 6, 8, 3, 5, 7, 9, 0, 1]
 
 
-def test_a_vector_alone_controls_nothing(tmp_path, capsys):
-    np.save(tmp_path / "v.npy", np.zeros(867))
-    assert main(["import", str(tmp_path / "v.npy"), "--out", str(tmp_path / "x.npz")]) == 2
-    assert "--like" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("name", "code", "named"),
+    [("v.npy", 2, "--like"), ("weights.h5", 1, "weights.h5"), ("controller.pkl", 1, "controller.pkl")],
+)
+def test_a_vector_alone_and_what_cannot_be_read_are_refused_with_the_reason(name, code, named, tmp_path, capsys):
+    if name == "v.npy":
+        np.save(tmp_path / name, np.zeros(867))
+    else:
+        (tmp_path / name).write_bytes(b"\x80\x04cos\nsystem\n")
+    assert main(["import", str(tmp_path / name), "--out", str(tmp_path / "x.npz")]) == code
+    assert named in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["weights.h5", "controller.pkl"])
-def test_what_cannot_be_read_is_refused_with_the_reason(name, tmp_path, capsys):
-    (tmp_path / name).write_bytes(b"\x80\x04cos\nsystem\n")
-    assert main(["import", str(tmp_path / name), "--out", str(tmp_path / "x.npz")]) == 1
-    assert name in capsys.readouterr().err
+def take_in(source, out):
+    return main(["import", str(source), "--out", str(out)])
 
 
-def drives_of(folder, count, **arrays):
-    for number in range(count):
-        np.savez_compressed(folder / f"{number}.npz", **arrays)
+@pytest.fixture
+def imported(tmp_path):
+    """Import two drives of these arrays; the first one."""
+
+    def first(**arrays):
+        source = tmp_path / "source"
+        source.mkdir()
+        for number in range(2):
+            np.savez_compressed(source / f"{number}.npz", **arrays)
+        assert take_in(source, tmp_path / "data") == 0
+        return episode_paths(tmp_path / "data")[0]
+
+    return first
 
 
-def test_drives_of_wme(tmp_path):
+def test_drives_of_wme(imported):
     pictures = np.random.default_rng(1).integers(0, 256, (6, 64, 64, 3), dtype=np.uint8)
-    source = tmp_path / "record"
-    source.mkdir()
-    drives_of(source, 2, obs=pictures, action=np.zeros((6, 3), np.float16))
-    assert main(["import", str(source), "--out", str(tmp_path / "data")]) == 0
-    first = episode_paths(tmp_path / "data")[0]
+    first = imported(obs=pictures, action=np.zeros((6, 3), np.float16))
     assert np.array_equal(load_pictures(first), pictures + np.uint8(1))
     assert load_steps(first)["reward"].tolist() == [0] * 6
 
@@ -188,30 +188,21 @@ def test_named_as_wmes_pictures_must_be_what_that_program_writes(tmp_path):
 @pytest.mark.parametrize(
     "names", [("obs", "action", "reward", "done"), ("observations", "actions", "rewards", "terminals")]
 )
-def test_drives_with_rewards_and_ends(names, tmp_path):
+def test_drives_with_rewards_and_ends(names, imported):
     pictures = np.random.default_rng(1).random((5, 64, 64, 3)).astype(np.float32)
-    source = tmp_path / "rollout"
-    source.mkdir()
-    done = np.array([False] * 4 + [True])
-    arrays = (pictures, np.zeros((5, 3)), np.arange(5.0), done)
-    drives_of(source, 2, **dict(zip(names, arrays, strict=True)))
-    assert main(["import", str(source), "--out", str(tmp_path / "data")]) == 0
-    first = episode_paths(tmp_path / "data")[0]
+    arrays = (pictures, np.zeros((5, 3)), np.arange(5.0), np.arange(5) == 4)
+    first = imported(**dict(zip(names, arrays, strict=True)))
     assert np.array_equal(load_pictures(first), np.round(pictures * 255).astype(np.uint8))
     steps = load_steps(first)
-    assert steps["reward"].tolist() == [0, 1, 2, 3, 4]
-    assert bool(steps["ended"])
+    assert (steps["reward"].tolist(), bool(steps["ended"])) == ([0, 1, 2, 3, 4], True)
 
 
-def test_whole_observations_are_cut_and_shrunk(tmp_path):
-    from dreamfleet.worker.worlds.car_racing.preprocessing import BOX
-
+def test_whole_observations_are_cut_and_shrunk(imported):
     whole = np.random.default_rng(1).integers(0, 256, (3, 96, 96, 3), dtype=np.uint8)
-    source = tmp_path / "drives"
-    source.mkdir()
-    drives_of(source, 2, observations=whole, actions=np.zeros((3, 3)), rewards=np.zeros(3), terminals=np.zeros(3, bool))
-    assert main(["import", str(source), "--out", str(tmp_path / "data")]) == 0
-    assert np.array_equal(load_pictures(episode_paths(tmp_path / "data")[0]), [BOX.picture(each) for each in whole])
+    first = imported(
+        observations=whole, actions=np.zeros((3, 3)), rewards=np.zeros(3), terminals=np.zeros(3, bool)
+    )  # fmt: skip
+    assert np.array_equal(load_pictures(first), [BOX.picture(each) for each in whole])
 
 
 @pytest.mark.parametrize(
@@ -231,16 +222,13 @@ def test_whole_observations_are_cut_and_shrunk(tmp_path):
 )
 def test_what_is_no_drive_is_refused(arrays, tmp_path, capsys):
     np.savez(tmp_path / "x.npz", **arrays)
-    assert main(["import", str(tmp_path / "x.npz"), "--out", str(tmp_path / "data")]) == 1
+    assert take_in(tmp_path / "x.npz", tmp_path / "data") == 1
     assert "x.npz" in capsys.readouterr().err
 
 
-def test_a_folder_with_drives_is_not_added_to(tmp_path, capsys):
-    source = tmp_path / "record"
-    source.mkdir()
-    drives_of(source, 2, obs=np.zeros((2, 64, 64, 3), np.uint8), action=np.zeros((2, 3)))
-    assert main(["import", str(source), "--out", str(tmp_path / "data")]) == 0
-    assert main(["import", str(source), "--out", str(tmp_path / "data")]) == 2
+def test_a_folder_with_drives_is_not_added_to(imported, tmp_path, capsys):
+    imported(obs=SEEN, action=STILL)
+    assert take_in(tmp_path / "source", tmp_path / "data") == 2
     assert "--out" in capsys.readouterr().err
 
 
@@ -256,7 +244,7 @@ def test_the_writer_of_the_page_makes_a_data_set(tmp_path, monkeypatch):
 def test_drives_of_ctallec_are_shifted_by_a_step(size, tmp_path, capsys):
     source = tmp_path / "carracing"
     first, _ = (ctallec_drive(source / f"thread_{each}", each, size=size) for each in range(2))
-    assert main(["import", str(source), "--out", str(tmp_path / "data")]) == 0
+    assert take_in(source, tmp_path / "data") == 0
     assert "ctallec" in capsys.readouterr().out
     path = episode_paths(tmp_path / "data")[0]
     whole = find_world().preprocessings["whole-64"]
@@ -268,17 +256,11 @@ def test_drives_of_ctallec_are_shifted_by_a_step(size, tmp_path, capsys):
     assert bool(steps["ended"])
 
 
-def test_drives_of_the_article_have_the_reward_of_the_step_before(tmp_path, capsys):
-    random = np.random.default_rng(1)
-    source = tmp_path / "rollout"
-    source.mkdir()
-    reward = np.array([-0.1, 7.0, -0.1, 3.0, -0.1])
-    pictures = random.integers(0, 256, (5, 64, 64, 3)).astype(np.float32) / 255
-    action = random.random((5, 3))
-    drives_of(source, 2, obs=pictures, action=action, reward=reward, done=np.array([False] * 4 + [True]))
-    assert main(["import", str(source), "--out", str(tmp_path / "data")]) == 0
+def test_drives_of_the_article_have_the_reward_of_the_step_before(imported, capsys):
+    random, reward = np.random.default_rng(1), np.array([-0.1, 7.0, -0.1, 3.0, -0.1])
+    pictures, action = random.integers(0, 256, (5, 64, 64, 3)).astype(np.float32) / 255, random.random((5, 3))
+    path = imported(obs=pictures, action=action, reward=reward, done=np.arange(5) == 4)
     assert "article" in capsys.readouterr().out
-    path = episode_paths(tmp_path / "data")[0]
     assert kind_of(path)[1] == "whole-64"
     assert np.array_equal(load_pictures(path), np.round(pictures[:-1] * 255).astype(np.uint8))
     steps = load_steps(path)
@@ -288,7 +270,7 @@ def test_drives_of_the_article_have_the_reward_of_the_step_before(tmp_path, caps
 
 def test_one_drive_is_no_drives(tmp_path):
     np.savez(tmp_path / "x.npz", obs=np.zeros((1, 64, 64, 3)), action=np.zeros((1, 3)))
-    assert main(["import", str(tmp_path / "x.npz"), "--out", str(tmp_path / "data")]) == 0
+    assert take_in(tmp_path / "x.npz", tmp_path / "data") == 0
     (path,) = (tmp_path / "data" / "episodes").glob("*.npz")
     assert len(load_pictures(path)) == 1
 
@@ -313,11 +295,3 @@ def test_a_world_model_is_trained_on_drives_of_ctallec(tmp_path, monkeypatch):
     assert main(["train", "mdnrnn", "--data", "data", "--set", "joint=true", "done=true", *few]) == 0
     assert main(["bundle", "--data", "data", "--out", "world.zip"]) == 0
     assert Bundle.open(Path("world.zip")).manifest.preprocessing == "whole-64"
-
-
-def test_other_pictures_are_not_collected_into_imported_drives(tmp_path, capsys):
-    for each in range(2):
-        ctallec_drive(tmp_path / "carracing", each)
-    assert main(["import", str(tmp_path / "carracing"), "--out", str(tmp_path / "data")]) == 0
-    assert main(["collect", "--data", str(tmp_path / "data"), "--preset", "paper", "--episodes", "3"]) == 1
-    assert "whole-64" in capsys.readouterr().err

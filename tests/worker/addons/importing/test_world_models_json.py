@@ -7,8 +7,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.bundle import INITIAL_LATENTS_PART, Bundle
 from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.artifacts.onnx_checks import read_float_array
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.worker.addons.importing.json_weights import read_mdnrnn, read_vae
@@ -26,20 +27,17 @@ def theirs(tmp_path_factory):
     """A folder as theirs, of random weights, and the numbers in it."""
     random = np.random.default_rng(1)
     folder = tmp_path_factory.mktemp("carracing")
-    vae = []
-    for before, after in pairwise(CHANNELS):
-        vae += [
-            whole_numbers(random, 4, 4, before, after, scale=(16 * before) ** -0.5),
-            whole_numbers(random, after, scale=0.1),
-        ]
-    for _ in range(2):
-        vae += [whole_numbers(random, 1024, LATENT, scale=1024**-0.5), whole_numbers(random, LATENT, scale=0.1)]
-    vae += [whole_numbers(random, LATENT, 1024, scale=0.2), whole_numbers(random, 1024, scale=0.1)]
-    for size, before, after in ((5, 1024, 128), (5, 128, 64), (6, 64, 32), (6, 32, 3)):
-        vae += [
-            whole_numbers(random, size, size, after, before, scale=before**-0.5),
-            whole_numbers(random, after, scale=0.1),
-        ]
+    down = [((4, 4, *channels), channels[1], (16 * channels[0]) ** -0.5) for channels in pairwise(CHANNELS)]
+    up = [((5, 5, 128, 1024), 128), ((5, 5, 64, 128), 64), ((6, 6, 32, 64), 32), ((6, 6, 3, 32), 3)]
+    layers = [
+        *down, *[((1024, LATENT), LATENT, 1024**-0.5)] * 2, ((LATENT, 1024), 1024, 0.2),
+        *((weights, biases, weights[-1] ** -0.5) for weights, biases in up),
+    ]  # fmt: skip
+    vae = [
+        whole_numbers(random, *shape, scale=each)
+        for weights, biases, scale in layers
+        for shape, each in ((weights, scale), ((biases,), 0.1))
+    ]
     rnn = [
         whole_numbers(random, HIDDEN, 3 * MIXTURES * LATENT, scale=0.05),
         whole_numbers(random, 3 * MIXTURES * LATENT, scale=0.1),
@@ -67,13 +65,8 @@ def drive_of_theirs(vae, rnn, controller, pictures):
         for layer in range(4):
             weight, offset = vae[2 * layer], vae[2 * layer + 1]
             side = (value.shape[0] - 4) // 2 + 1
-            patches = np.stack(
-                [
-                    value[2 * row : 2 * row + 4, 2 * column : 2 * column + 4]
-                    for row in range(side)
-                    for column in range(side)
-                ]
-            )
+            corners = [(2 * row, 2 * column) for row in range(side) for column in range(side)]
+            patches = np.stack([value[row : row + 4, column : column + 4] for row, column in corners])
             value = np.maximum(np.tensordot(patches, weight, 3) + offset, 0).reshape(side, side, -1)
         latent = value.ravel() @ vae[8] + vae[9]
         logits = np.concatenate([latent, hidden]) @ controller[3:].reshape(-1, 3) + controller[:3]
@@ -91,13 +84,19 @@ def sigmoid(value):
     return 1 / (1 + np.exp(-value))
 
 
+@pytest.fixture(scope="module")
+def bundle(theirs):
+    path = theirs[0] / "wme.zip"
+    assert main(["import", str(theirs[0]), "--out", str(path)]) == 0
+    return Bundle.open(path)
+
+
 @pytest.mark.slow
-def test_a_controller_acts_as_in_their_program(theirs, tmp_path):
+def test_a_controller_acts_as_in_their_program(theirs, bundle, tmp_path):
     folder, vae, rnn, vector = theirs
-    assert main(["import", str(folder), "--out", str(tmp_path / "wme.zip")]) == 0
     out = tmp_path / "best.npz"
-    assert main(["import", str(folder / "best.json"), "--bundle", str(tmp_path / "wme.zip"), "--out", str(out)]) == 0
-    controller, bundle = Controller.load(out), Bundle.open(tmp_path / "wme.zip")
+    assert main(["import", str(folder / "best.json"), "--bundle", str(bundle.path), "--out", str(out)]) == 0
+    controller = Controller.load(out)
     pictures = np.random.default_rng(2).integers(1, 256, (20, 64, 64, 3), dtype=np.uint8)
     wanted, _ = drive_of_theirs(vae, rnn, vector, pictures)
     state, actions = None, []
@@ -117,17 +116,11 @@ def test_heads_are_in_our_order(theirs):
     assert np.allclose(weights["heads.weight"][ours_row], rnn[0][:, theirs_column] / 10_000)
 
 
-def test_dreams_begin_where_theirs_do(theirs, tmp_path):
-    folder, *_ = theirs
-    assert main(["import", str(folder), "--out", str(tmp_path / "wme.zip")]) == 0
-    from dreamfleet.common.artifacts.bundle import INITIAL_LATENTS_PART
-    from dreamfleet.common.artifacts.onnx_checks import read_float_array
-
-    found = read_float_array(Bundle.open(tmp_path / "wme.zip").read(INITIAL_LATENTS_PART))
-    wanted = np.array(json.loads((folder / "initial_z" / "initial_z.json").read_text())) / 10_000
+def test_dreams_begin_where_theirs_do(theirs, bundle):
+    found = read_float_array(bundle.read(INITIAL_LATENTS_PART))
+    wanted = np.array(json.loads((theirs[0] / "initial_z" / "initial_z.json").read_text())) / 10_000
     assert found.shape == (7, 2, LATENT)
-    assert np.allclose(found[:, 0], wanted[0])
-    assert np.allclose(found[:, 1], wanted[1])
+    assert np.allclose(found, wanted.swapaxes(0, 1))
 
 
 @pytest.mark.parametrize(
