@@ -7,6 +7,7 @@ import numpy as np
 from dreamfleet.common.artifacts.actions import Continuous, grouped, one_hot
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, write_bundle
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts, WorldFacts
+from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.dream.environment import Dream
 from dreamfleet.worker.tasks.api import Score
@@ -55,6 +56,11 @@ def with_end(bundle, path, probability, **facts):
     parts = {name: bundle.read(name) for name in bundle.manifest.parts}
     manifest = dataclasses.replace(bundle.manifest, world=dataclasses.replace(bundle.manifest.world, **facts))
     return write_bundle(path, manifest, {**parts, DREAM_GRAPH: export_dream(weights, rnn)})
+
+
+def spec_of(bundle, horizon, **more):
+    """The specification of a run in the bundle's dream."""
+    return TaskSpec("dream", bundle.sha256, horizon, 0, **more)
 
 
 class DreamPolicy:

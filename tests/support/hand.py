@@ -3,6 +3,7 @@
 import hashlib
 import json
 import queue
+from contextlib import contextmanager
 from dataclasses import asdict
 
 import zenoh
@@ -23,7 +24,6 @@ from dreamfleet.common.protocol.messages import (
     ResultBatch,
     TaskSpec,
     UploadPart,
-    VectorPart,
     Verdict,
 )
 from dreamfleet.common.transport.session import Network, open_session
@@ -31,7 +31,7 @@ from tests.support import samples
 from tests.support.processes import DEADLINE
 
 FIRST, SECOND = "aaaaaaaaaaaaaaaa", "bbbbbbbbbbbbbbbb"
-WHOLE = VectorPart(id=samples.VECTOR_ID, dtype="<f4", shape=(16,), offset=0, data=samples.VECTOR)
+SLOW_BEATS = Intervals(beat=60.0, repeat=0.1)  # the longest valid ones
 
 
 class Hand:
@@ -134,7 +134,7 @@ class Hand:
     def job(self, episode=0, kind="score"):
         return samples.job(episode, kind, spec=self.spec)
 
-    def batch(self, number, *jobs, vectors=(WHOLE,), cancels=(), accepted=(), ended=False, **head):
+    def batch(self, number, *jobs, vectors=(samples.WHOLE,), cancels=(), accepted=(), ended=False, **head):
         verdicts = tuple(Verdict(job.digest, "accepted") for job in accepted)
         whole = {
             "run_uid": self.run_uid, "incarnation": self.incarnation, "nonce": self.nonce,
@@ -194,6 +194,19 @@ class Hand:
                 offset=offset, total=self.total(), data=data,
             )  # fmt: skip
             query.reply(query.key_expr, encode(part))
+
+
+@contextmanager
+def stranger(hand, key, answer):
+    """Another session at the router of `hand`: it answers each query first, as if for all, by `answer(query)`."""
+
+    def reply(query):
+        with query:
+            query.reply(query.key_expr, answer(query))
+
+    with open_session(Network(connect=(hand.endpoint,))) as session:
+        session.declare_queryable(key, reply, complete=True)
+        yield
 
 
 def _digests(batch):

@@ -10,8 +10,10 @@ import socket
 import subprocess
 import threading
 import time
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from pathlib import Path
+
+import psutil
 
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.client.client import Client
@@ -21,6 +23,13 @@ from dreamfleet.common.host.reports import ADDRESS
 
 ROOT = Path(__file__).parents[2]
 DEADLINE = 300  # seconds to wait for an event: many times the usual, since a machine may be busy
+
+
+def runs(pid):
+    """Whether a process is there, and not only waits to be reaped."""
+    with suppress(psutil.NoSuchProcess):
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    return False
 
 
 def free_port():

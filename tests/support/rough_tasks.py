@@ -176,11 +176,6 @@ class Exiting(Rough):
         os._exit(0)
 
 
-class ExitingWithStatus(Rough):
-    def misbehave(self):
-        os._exit(3)
-
-
 class Deaf(Rough):
     """Takes no notice of signals, and hangs."""
 

@@ -60,10 +60,18 @@ def job(episode=0, kind="score", candidate=2, spec=SPEC, seed=1048576, **named):
     )
 
 
+WHOLE = VectorPart(id=VECTOR_ID, dtype="<f4", shape=(16,), offset=0, data=VECTOR)
+
+
+def batch(number, jobs=(), vectors=(WHOLE,), cancels=()):
+    return JobBatch(
+        **HEAD, nonce="n", numbering=0, number=number, vectors=vectors, jobs=tuple(jobs), cancels=cancels, verdicts=()
+    )
+
+
 MSGPACK = {
     "job": JobBatch(
-        **HEAD, nonce="c0ffee00c0ffee00", numbering=3, number=9,
-        vectors=(VectorPart(id=VECTOR_ID, dtype="<f4", shape=(16,), offset=0, data=VECTOR),),
+        **HEAD, nonce="c0ffee00c0ffee00", numbering=3, number=9, vectors=(WHOLE,),
         jobs=(job(), job(1), job(0, "evaluate"), job(0, "collect")), cancels=(b"\x05" * 32,),
         verdicts=tuple(Verdict(bytes([n]) * 32, word) for n, word in enumerate(VERDICTS)),
     ),

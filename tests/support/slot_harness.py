@@ -43,6 +43,7 @@ class Harness:
     def wait_ready(self):
         while not self.slot.ready:
             self.take()
+        return self
 
     def take(self):
         """What the slot's next event brings; as a worker does, it looks at the slot often, and starts a child."""

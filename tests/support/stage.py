@@ -46,6 +46,10 @@ class Stage:
         hand.ready()
         return hand, made, served
 
+    def error(self, **config):
+        """What ends a worker that leaves with its run."""
+        return self.worker(exit_when_done=True, **config)[1].exception(DEADLINE)
+
     def close(self):
         for made, served in self.workers:
             made.stop()

@@ -9,13 +9,12 @@ from tests.support.strict_environments import ACTIONS, STRICT
 from tests.support.stuck_environments import MODULE
 
 
-def try_out(name, announced=None, **arguments):
-    announce = [].append if announced is None else announced.append
+def try_out(name, announce=lambda _step: None, **arguments):
     *_, found = dry_run(f"gym:{name}", {"environment": arguments}, announce, thorough=True)
     return found
 
 
-@pytest.mark.parametrize("actions", [each for each in ACTIONS if each != "endless"])
+@pytest.mark.parametrize("actions", sorted({*ACTIONS} - {"endless"}))
 def test_both_ends_of_the_actions_are_tried(actions):
     assert try_out(STRICT, actions=actions).warnings == ()
 
@@ -27,7 +26,7 @@ def test_both_ends_of_the_actions_are_tried(actions):
 def test_an_action_that_the_environment_cannot_take_is_named(actions, breaks):
     announced = []
     with pytest.raises(RuntimeError):
-        try_out(STRICT, announced, actions=actions, breaks=breaks)
+        try_out(STRICT, announced.append, actions=actions, breaks=breaks)
     assert "action" in announced[-1]
 
 
@@ -41,7 +40,7 @@ def test_a_close_that_hangs_is_called_so(monkeypatch):
     monkeypatch.setattr(closing, "CLOSE_LIMIT", 0.2)
     monkeypatch.setattr(closing, "_hung", {})
     announced = []
-    found = try_out(f"{MODULE}:StuckClose-v0", announced)
+    found = try_out(f"{MODULE}:StuckClose-v0", announced.append)
     assert announced[-1] == "close()"
     assert found.warnings == tuple(closing._hung.values()) != ()
 

@@ -8,22 +8,21 @@ import pytest
 from dreamfleet.common.artifacts.bundle import write_bundle
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
 from dreamfleet.common.errors import BundleError
-from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.addons.recording.parallel_dream import DreamContinuation, ParallelDream, ParallelDreamConfig
 from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.dream.noise import EpisodeNoise
 from dreamfleet.worker.dream.world import DreamEnds, DreamWorld
 from dreamfleet.worker.worldmodel.inference import DreamStep
-from tests.support.dreams import with_end, write_bundle_of
+from tests.support.dreams import spec_of, with_end, write_bundle_of
 
 DREAMS, HORIZON = 2000, 200
 
 
 def lengths(bundle, temperature):
     """The lengths of many dreams of one controller, and what they earned."""
-    spec = TaskSpec("dream", bundle.sha256, HORIZON, 0, temperature=temperature)
     parameters = np.zeros(bundle.controller_shape.size, np.float32)
-    scores = DreamBatch(bundle, spec).score([(parameters, seed) for seed in range(DREAMS)])
+    dreams = DreamBatch(bundle, spec_of(bundle, HORIZON, temperature=temperature))
+    scores = dreams.score([(parameters, seed) for seed in range(DREAMS)])
     return np.array([score.steps for score in scores]), np.array([score.fitness for score in scores])
 
 
@@ -46,16 +45,13 @@ def test_a_threshold_is_the_same_at_every_step_and_temperature(choices_bundle, t
     assert DreamWorld(bundle, 1.0).bars is None
 
 
-def test_a_bundle_without_facts_has_the_threshold_of_always(random_bundle):
-    assert DreamEnds(random_bundle, 1.0).rule == EndRule("threshold", 0.5)
-    assert DreamEnds(random_bundle, 1.0).bars is None
-
-
-def test_a_rule_in_place_of_the_bundles_keeps_the_weight_of_its_odds(choices_bundle):
+def test_a_rule_in_place_of_the_bundles_keeps_the_weight_of_its_odds(choices_bundle, random_bundle):
     own = choices_bundle.manifest.world.end
     assert DreamEnds(choices_bundle, 1.0).rule == own
     assert DreamEnds(choices_bundle, 1.0, "drawn").rule == own
     assert DreamEnds(choices_bundle, 1.0, "0.25").rule == EndRule(at=0.25, odds_weight=own.odds_weight)
+    without_facts = DreamEnds(random_bundle, 1.0)
+    assert (without_facts.rule, without_facts.bars) == (EndRule("threshold", 0.5), None)
 
 
 def test_dreams_beside_a_drive_and_from_a_moment_end_by_the_rule_too(choices_bundle, tmp_path):
@@ -99,8 +95,3 @@ def test_a_reward_that_the_model_does_not_predict_is_refused(tmp_path):
         wrong = with_end(bundle, tmp_path / "wrong.zip", 0.5, reward=RewardFacts(source))
         with pytest.raises(BundleError):
             DreamWorld(wrong, 1.0)
-
-
-def test_a_draw_without_bars_has_the_threshold(choices_bundle):
-    reached = DreamEnds(choices_bundle, 1.0).are_reached(np.array([0.49, 0.51], np.float32), None)
-    assert reached.tolist() == [False, True]

@@ -14,34 +14,14 @@ ACTION = np.array([0.1, 0.5, 0.0], np.float32)
 
 
 @pytest.mark.parametrize("features", ["z", "zh"])
-def test_gymnasium_accepts_it(random_bundle, features):
-    made = gymnasium.make(CAR_RACING_ENVIRONMENT, bundle=random_bundle, render_mode="rgb_array", features=features)
+def test_gymnasium_accepts_the_dream_of_any_world(world, world_bundle, features):
+    made = gymnasium.make(ENVIRONMENT, bundle=world_bundle, render_mode="rgb_array", features=features)
     check_env(made.unwrapped)
     made.reset(seed=1)
     assert made.render().shape == (64, 64, 3)
-
-
-def test_gymnasium_accepts_the_dream_of_any_world(world, world_bundle):
-    made = gymnasium.make(ENVIRONMENT, bundle=world_bundle, render_mode="rgb_array")
-    check_env(made.unwrapped)
     assert made.metadata["render_fps"] == (10 if WORLDS[world] else 50)
     assert made.action_space.contains(ACTIONS[world])
-
-
-def test_a_dream_is_a_function_of_seed_and_actions(random_bundle):
-    environment = Dream(random_bundle, horizon=5)
-
-    def dream(seed):
-        latents = [environment.reset(seed=seed)[0]]
-        for step in range(5):
-            latent, _, _, truncated, _ = environment.step(ACTION)
-            latents.append(latent)
-            assert truncated == (step == 4)
-        return np.stack(latents)
-
-    first = dream(3)
-    assert not np.array_equal(first, dream(4))
-    assert np.array_equal(first, dream(3))
+    assert gymnasium.spec(CAR_RACING_ENVIRONMENT).entry_point == made.spec.entry_point
 
 
 def test_the_hidden_state_behind_the_latent_is_what_a_controller_remembers(random_bundle):
@@ -57,12 +37,15 @@ def test_the_hidden_state_behind_the_latent_is_what_a_controller_remembers(rando
 
 @pytest.mark.parametrize("features", ["z", "zh"])
 def test_vectorised_dreams_equal_single_ones_and_begin_anew(world, world_bundle, features):
-    seeds, made = range(10, 16), {"bundle": world_bundle, "horizon": 6, "features": features}
+    made = {"bundle": world_bundle, "horizon": 6, "features": features, "recorded": 0.5}
     many = gymnasium.make_vec(ENVIRONMENT, num_envs=6, vectorization_mode="vector_entry_point", **made)
     assert isinstance(many.unwrapped, VectorDream)
-    single, actions = [Dream(**made) for _ in seeds], np.stack([ACTIONS[world]] * 6)
-    latents, _ = many.reset(seed=seeds[0])
-    assert np.array_equal(latents, [each.reset(seed=seed)[0] for each, seed in zip(single, seeds, strict=True)])
+    single, actions = [Dream(**made) for _ in range(6)], np.stack([ACTIONS[world]] * 6)
+    latents, info = many.reset(seed=10)
+    begun = [each.reset(seed=10 + index) for index, each in enumerate(single)]
+    assert np.array_equal(latents, [latent for latent, _ in begun])
+    assert np.array_equal(info["memory"], [given["memory"] for _, given in begun])
+    assert 0 < info["memory"].any(axis=1).sum() < 6, "some begin at recorded states"
     going, ends = set(range(6)), 0
     for _ in range(6):
         latents, rewards, done, truncated, _ = many.step(actions)
@@ -75,7 +58,9 @@ def test_vectorised_dreams_equal_single_ones_and_begin_anew(world, world_bundle,
             going -= {index} if any(over) else set()
     assert not going
     assert bool(ends) == bool(WORLDS[world]), "the worlds with a drawn rule end some of their dreams"
-    assert not np.stack(many.step(actions)[1:4])[:, last].any(), "those that ended last begin anew"
+    _, *rest, info = many.step(actions)
+    assert not np.stack(rest)[:, last].any(), "those that ended last begin anew"
+    assert info["_memory"][last].all()
 
 
 def test_a_choice_may_be_its_number_or_its_row(choices_bundle):
@@ -119,11 +104,11 @@ def test_another_rule_of_the_end_may_be_given(choices_bundle):
     environment = Dream(choices_bundle, end="0.0")
     environment.reset(seed=1)
     assert environment.step(1)[1:3] == (0.0, True)
-    with pytest.raises(UsageError, match="'never'"):
-        Dream(choices_bundle, end="never")
 
 
-@pytest.mark.parametrize("temperature", [0.0, -1.0, float("nan"), float("inf")])
-def test_an_invalid_temperature_is_refused(random_bundle, temperature):
+@pytest.mark.parametrize(
+    "setting", [{"end": "never"}, *({"temperature": t} for t in (0.0, -1.0, np.nan, np.inf))], ids=str
+)
+def test_no_rule_and_no_temperature_are_refused(choices_bundle, setting):
     with pytest.raises(UsageError):
-        Dream(random_bundle, temperature=temperature)
+        Dream(choices_bundle, **setting)

@@ -6,21 +6,7 @@ from dreamfleet.worker.worldmodel.inference import NoiseSize
 
 FIRST = np.random.default_rng(0).normal(size=(5, 2, 3)).astype(np.float32)
 BEGINNINGS = StartStates(FIRST, np.zeros((0, 6), np.float32))
-
-
-def drawn(seed, steps):
-    noise, drawn = EpisodeNoise(seed, NoiseSize(3, 4, 0.0)), []
-    drawn.append(noise.begin(BEGINNINGS).latent)
-    for _ in range(steps):
-        draw = noise.next()
-        drawn += [draw.uniform[0], draw.normal[0]]
-    return drawn
-
-
-def test_it_is_a_function_of_the_seed():
-    first, again, other = (drawn(seed, 2 * BLOCK_STEPS) for seed in (1, 1, 2))
-    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
-    assert not any(np.array_equal(a, b) for a, b in zip(first, other, strict=True))
+CHANCE = NoiseSize(3, 4, 0.0)
 
 
 def test_the_choice_of_a_mixture_is_uniform_and_the_rest_normal():
@@ -31,16 +17,6 @@ def test_the_choice_of_a_mixture_is_uniform_and_the_rest_normal():
     assert abs(draw.normal.mean()) < 0.15
     assert 0.9 < draw.normal.std() < 1.1
     assert draw.mask is None
-
-
-def test_rows_of_one_seed_share_their_noise_whichever_rows_still_dream():
-    shared = SharedNoise(np.array([7, 8, 7, 9]), NoiseSize(3, 4, 0.0), BEGINNINGS)
-    assert np.array_equal(shared.first.latent[0], shared.first.latent[2])
-    assert np.array_equal(shared.first.latent[1], drawn(8, 0)[0])
-    shared.next(np.arange(4))
-    later = shared.next(np.array([1, 2]))
-    assert np.array_equal(later.uniform[0], drawn(8, 2)[3])
-    assert np.array_equal(later.normal[1], drawn(7, 2)[4])
 
 
 def bars_of(uniform):
@@ -62,14 +38,17 @@ def test_drawn_ends_have_their_own_numbers_so_that_all_others_stay():
     assert len(np.unique(bars)) == 2 * BLOCK_STEPS
 
 
-def test_rows_of_one_seed_share_their_bars_too():
-    shared = SharedNoise(np.array([7, 8, 7]), NoiseSize(3, 4, 0.0), BEGINNINGS, bars_of)
-    alone = EpisodeNoise(7, NoiseSize(3, 4, 0.0), bars_of)
+def test_rows_of_one_seed_share_noise_and_bars_whichever_rows_still_dream():
+    shared = SharedNoise(np.array([7, 8, 7]), CHANCE, BEGINNINGS, bars_of)
+    alone = {seed: EpisodeNoise(seed, CHANCE, bars_of) for seed in (7, 8)}
+    first = {seed: noise.begin(BEGINNINGS).latent for seed, noise in alone.items()}
+    assert np.array_equal(shared.first.latent, [first[7], first[8], first[7]])
     for rows in ([0, 1, 2], [1, 2], [2]):
-        found, bar = shared.next(np.array(rows)).bar, alone.next().bar
-        assert found.shape == (len(rows), 1)
-        for row, each in zip(rows, found, strict=True):
-            assert np.array_equal(each, bar[0]) == (row != 1)
+        found, draws = shared.next(np.array(rows)), {seed: noise.next() for seed, noise in alone.items()}
+        for name in ("uniform", "normal", "bar"):
+            wanted = [getattr(draws[8 if row == 1 else 7], name)[0] for row in rows]
+            assert np.array_equal(getattr(found, name), wanted)
+    assert not np.array_equal(draws[7].normal, draws[8].normal)
 
 
 def test_dropout_keeps_the_mean_and_is_shared_too():

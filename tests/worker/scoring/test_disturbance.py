@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
+from dreamfleet import find_bundle, find_controller
 from dreamfleet.common.artifacts.actions import FIVE_CHOICES, STEERING_GAS_BRAKE, one_hot
-from dreamfleet.common.artifacts.bundle_store import find_bundle
-from dreamfleet.common.runs.lookup import find_controller
 from dreamfleet.worker.scoring.actors import ControllerActor
 from dreamfleet.worker.scoring.disturbance import (
     ActionBursts,
@@ -79,8 +78,6 @@ def test_choices_of_numbers_are_disturbed_as_numbers():
 
 
 class Recorder(DisturbedPolicy):
-    """Records each action and its noise."""
-
     def on_action(self, action, push):
         self.noted = (*getattr(self, "noted", ()), (action, push))
 
@@ -90,9 +87,8 @@ def tiny():
     return find_bundle("tiny")
 
 
-def driver(tiny, tmp_path, noise, watching=None):
-    controller, _ = find_controller("tiny", tmp_path)
-    mind = RecurrentState(tiny)
+def driver(tiny, noise, watching=None):
+    mind, controller = RecurrentState(tiny), find_controller("tiny")
     return mind, Recorder(ControllerActor(controller, tiny, mind), Disturbance(3, STEERING_GAS_BRAKE, noise), watching)
 
 
@@ -100,10 +96,9 @@ def pictures(count):
     return np.random.default_rng(0).integers(0, 255, (count, 64, 64, 3), dtype=np.uint8)
 
 
-def test_every_recurrent_state_gets_the_disturbed_action(tiny, tmp_path):
-    watching = RecurrentState(tiny)
-    mind, policy = driver(tiny, tmp_path, 0.5, watching)
-    calm = RecurrentState(tiny)
+def test_every_recurrent_state_gets_the_disturbed_action(tiny):
+    watching, calm = RecurrentState(tiny), RecurrentState(tiny)
+    mind, policy = driver(tiny, 0.5, watching)
     for picture in pictures(5):
         done = policy.act(picture)
         calm.see(picture)
@@ -116,10 +111,9 @@ def test_every_recurrent_state_gets_the_disturbed_action(tiny, tmp_path):
     assert not watching.state.any()
 
 
-def test_without_noise_it_does_what_the_actor_chooses(tiny, tmp_path):
-    mind, policy = driver(tiny, tmp_path, 0.0)
-    controller, _ = find_controller("tiny", tmp_path)
-    hand = ControllerActor(controller, tiny, mind)
+def test_without_noise_it_does_what_the_actor_chooses(tiny):
+    mind, policy = driver(tiny, 0.0)
+    hand = ControllerActor(find_controller("tiny"), tiny, mind)
     for picture in pictures(3):
         policy.begin()
         done = policy.act(picture)

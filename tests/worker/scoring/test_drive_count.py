@@ -5,20 +5,19 @@ import pytest
 from dreamfleet.worker.scoring.drive_count import ENOUGH, MEASURE_AGAIN, DriveCount
 
 
-def drive(count, costs, groups, waiting=99):
-    """The numbers that are asked for by groups that take as long as `costs`: seconds a step by number of drives."""
-    asked = []
-    for _ in range(groups):
-        drives = count.choose(waiting)
-        asked.append(drives)
-        count.add(drives, 1000 * drives, 1000 * drives * costs[drives])
-    return asked
-
-
 def counting(most):
     count = DriveCount()
     count.most = most
     return count
+
+
+def drive(count, costs, groups, waiting=99):
+    """The numbers that are asked for by groups that take as long as `costs`: seconds a step by number of drives."""
+    asked = []
+    for _ in range(groups):
+        asked.append(drives := count.choose(waiting))
+        count.add(drives, 1000 * drives, 1000 * drives * costs[drives])
+    return asked
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,6 @@ PARAMETERS = np.zeros(3, np.float32)
 
 
 class Scripted(gymnasium.Env):
-    """An environment with given rewards."""
-
     observation_space = spaces.Box(-1, 1, (1,))
     action_space = spaces.Box(-1, 1, (1,))
 
@@ -38,37 +36,31 @@ class Still:
         return np.zeros(1)
 
 
-class Listening(Still):
-    def begin(self, parameters):
-        self.heard = []
-
-    def reward(self, value):
-        self.heard.append(value)
+def drive(rewards, info=None, horizon=100, **settings):
+    """The score of an episode with these rewards, under a policy that does nothing."""
+    return score(Scripted(rewards, info), Still(), PARAMETERS, EpisodeConfig(1, horizon, **settings))
 
 
-def test_a_reward_aware_policy_gets_every_reward():
-    policy = Listening()
-    score(Scripted([1.0, 2.0, 3.5]), policy, PARAMETERS, EpisodeConfig(1, 100))
-    assert policy.heard == [1.0, 2.0, 3.5]
+@pytest.mark.parametrize(("horizon", "fitness", "steps"), [(2, 3.0, 2), (3, 6.5, 3), (100, 6.5, 3)])
+def test_fitness_is_the_sum_of_rewards_until_the_end_or_the_horizon_and_each_step_is_reported(horizon, fitness, steps):
+    class Listening(Still):
+        heard = ()
 
+        def reward(self, value):
+            self.heard += (value,)
 
-def test_fitness_is_the_sum_of_rewards_until_the_end():
-    for horizon in (3, 100):
-        driven = score(Scripted([1.0, 2.0, 3.5]), Still(), PARAMETERS, EpisodeConfig(1, horizon))
-        assert (driven.fitness, driven.steps) == (6.5, 3)
-
-
-def test_the_horizon_ends_an_episode():
-    assert score(Scripted([1.0] * 10), Still(), PARAMETERS, EpisodeConfig(1, 4)).steps == 4
+    policy, reported = Listening(), []
+    found = score(Scripted([1.0, 2.0, 3.5]), policy, PARAMETERS, EpisodeConfig(1, horizon), reported.append)
+    assert (found.fitness, found.steps) == (fitness, steps)
+    assert reported == list(range(1, steps + 1))
+    assert policy.heard == (1.0, 2.0, 3.5)[:steps]
 
 
 def test_an_episode_that_patience_cuts_is_charged_for_standing_still():
-    driven = score(
-        Scripted([3.0] + [-0.1] * 99), Still(), PARAMETERS, EpisodeConfig(1, 100, patience=20, idle_cost=0.1)
-    )
-    whole = score(Scripted([3.0] + [-0.1] * 99), Still(), PARAMETERS, EpisodeConfig(1, 100))
-    assert driven.steps == 21
-    assert driven.fitness == pytest.approx(whole.fitness)
+    rewards = [3.0] + [-0.1] * 99
+    cut = drive(rewards, patience=20, idle_cost=0.1)
+    assert cut.steps == 21
+    assert cut.fitness == pytest.approx(drive(rewards).fitness)
 
 
 @pytest.mark.parametrize(
@@ -82,15 +74,12 @@ def test_an_episode_that_patience_cuts_is_charged_for_standing_still():
     ],
 )
 def test_time_is_charged_until_the_course_is_finished_and_after_a_crash(rewards, info, paid):
-    free = EpisodeConfig(1, 20, patience=5, finish="lap")
-    found = [score(Scripted(rewards, info), Still(), PARAMETERS, each) for each in (free, replace(free, time_cost=0.5))]
-    assert found[0].fitness - found[1].fitness == 0.5 * paid
-    assert found[0].steps == found[1].steps
+    free, dear = (drive(rewards, info, 20, patience=5, finish="lap", time_cost=cost) for cost in (0.0, 0.5))
+    assert free.fitness - dear.fitness == 0.5 * paid
+    assert free.steps == dear.steps
 
 
 class OffCourse(Scripted):
-    """An environment whose `info` says at given steps that they are off the course."""
-
     def __init__(self, rewards, off_course_steps):
         super().__init__(rewards)
         self._off_course_steps = off_course_steps
@@ -105,29 +94,21 @@ class OffCourse(Scripted):
 )
 def test_steps_off_the_course_are_charged_up_to_a_limit(off_course_steps, paid):
     free = EpisodeConfig(1, 200, off_course="off")
-    course = [free, replace(free, off_course_cost=2.0)]
+    course = free, replace(free, off_course_cost=2.0)
     found = [score(OffCourse([0.0] * 199, off_course_steps), Still(), PARAMETERS, each) for each in course]
     assert found[0].fitness - found[1].fitness == 2 * paid
     assert found[0].steps == found[1].steps
 
 
 def test_reward_restores_patience():
-    rewards = ([-0.1] * 9 + [1.0]) * 5
-    assert score(Scripted(rewards), Still(), PARAMETERS, EpisodeConfig(1, 100, patience=10)).steps == 50
-
-
-def test_steps_are_reported_as_they_are_made():
-    reported = []
-    score(Scripted([0.0] * 5), Still(), PARAMETERS, EpisodeConfig(1, 100), reported.append)
-    assert reported == [1, 2, 3, 4, 5]
+    assert drive(([-0.1] * 9 + [1.0]) * 5, patience=10).steps == 50
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_sum_that_is_not_finite_is_an_error(value):
-    with pytest.raises(ValueError):
-        score(Scripted([1.0]), Still(), np.full(3, value, np.float32), EpisodeConfig(1, 10))
-    with pytest.raises(ValueError):
-        score(Scripted([value]), Still(), PARAMETERS, EpisodeConfig(1, 10))
+    for parameters, reward in ((np.full(3, value, np.float32), 1.0), (PARAMETERS, value)):
+        with pytest.raises(ValueError):
+            score(Scripted([reward]), Still(), parameters, EpisodeConfig(1, 10))
 
 
 class Demanding(Scripted):

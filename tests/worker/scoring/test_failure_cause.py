@@ -3,7 +3,6 @@
 import errno
 import signal
 
-import numpy as np
 import pytest
 
 from dreamfleet.common.errors import BundleError, UsageError
@@ -18,53 +17,26 @@ def raised_from(cause):
         return error
 
 
-def unbounded():
-    return np.zeros(2**56)
+HOST = [
+    MemoryError(),
+    *(OSError(number, "") for number in (errno.ENOSPC, errno.EROFS, errno.EMFILE)),
+    BlockingIOError(errno.EAGAIN, "no process left"),
+    RuntimeError("can't start new thread"),
+    raised_from(OSError(errno.ENOMEM, "no memory")),
+    -signal.SIGKILL,
+]
+OTHER = [
+    ValueError("x"), FileNotFoundError(errno.ENOENT, "no file"), RuntimeError("the road has ended"), raised_from(None),
+    SystemExit(1), 0, 3, -signal.SIGSEGV, -signal.SIGTERM,
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "cause",
-    [
-        MemoryError(),
-        OSError(errno.ENOSPC, "full"),
-        OSError(errno.EROFS, "read-only"),
-        OSError(errno.EMFILE, "too many files"),
-        BlockingIOError(errno.EAGAIN, "no process left"),
-        RuntimeError("can't start new thread"),
-        raised_from(OSError(errno.ENOMEM, "no memory")),
-        -signal.SIGKILL,
-    ],
-)
-def test_the_host_is_at_fault(cause):
-    assert is_hosts_fault(cause)
-    assert (crash(cause) if isinstance(cause, int) else failure_of(cause)).kind == "host"
-
-
-@pytest.mark.parametrize(
-    "cause",
-    [
-        ValueError("x"),
-        FileNotFoundError(errno.ENOENT, "no file"),
-        RuntimeError("the road has ended"),
-        raised_from(None),
-        SystemExit(1),
-        0,
-        3,
-        -signal.SIGSEGV,
-        -signal.SIGTERM,
-    ],
-)
-def test_the_candidate_is_at_fault(cause):
-    assert not is_hosts_fault(cause)
-    assert (crash(cause) if isinstance(cause, int) else failure_of(cause)).kind == (
-        "crash" if isinstance(cause, int) else "other"
-    )
-
-
-def test_numpys_lack_of_memory_is_the_hosts_fault():
-    with pytest.raises(MemoryError) as caught:
-        unbounded()
-    assert failure_of(caught.value).kind == "host"
+@pytest.mark.parametrize("cause", [*HOST, *OTHER], ids=repr)
+def test_who_is_at_fault_follows_from_the_error_or_the_exit_status(cause):
+    is_status, is_host = isinstance(cause, int), cause in HOST
+    assert is_hosts_fault(cause) == is_host
+    found = crash(cause) if is_status else failure_of(cause)
+    assert found.kind == ("host" if is_host else "crash" if is_status else "other")
 
 
 @pytest.mark.parametrize(

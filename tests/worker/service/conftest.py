@@ -8,6 +8,7 @@ from dreamfleet.common.artifacts.bundle_store import BundleStore, default_cache
 from dreamfleet.common.artifacts.car_racing_variants import FACTS
 from dreamfleet.common.protocol.messages import MAX_PART
 from tests.support.bundles import npy
+from tests.support.slot_harness import Harness
 from tests.support.stage import Stage, listening
 
 PARTS = 6  # of the small bundle
@@ -43,3 +44,17 @@ def said():
     """The log of a worker, for `wait_for`."""
     with listening() as lines:
         yield lines
+
+
+@pytest.fixture
+def harness(random_bundle):
+    """Makes slots of a task, with another bundle than the random one if given."""
+    made = []
+
+    def make(task, bundle=None, **more):
+        made.append(Harness(task, bundle or random_bundle.path, **more))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.slot.stop()

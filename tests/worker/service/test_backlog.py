@@ -2,50 +2,30 @@ import hashlib
 
 from msgspec.structs import replace
 
-from dreamfleet.common.protocol.messages import MAX_LEASES, MAX_PART, JobBatch, VectorPart
+from dreamfleet.common.protocol.messages import MAX_LEASES, MAX_PART, VectorPart
 from dreamfleet.worker.service import backlog as room
 from dreamfleet.worker.service.backlog import DAMAGED, MAX_BATCHES_AHEAD, MAX_UNUSED_VECTORS, Backlog
-from tests.support.samples import HEAD, SPEC, VECTOR, VECTOR_ID, job
-
-WHOLE = VectorPart(id=VECTOR_ID, dtype="<f4", shape=(16,), offset=0, data=VECTOR)
+from tests.support.samples import SPEC, VECTOR, WHOLE, batch, job
 
 
-def batch(number, jobs=(), vectors=(WHOLE,), cancels=()):
-    return JobBatch(
-        **HEAD, nonce="n", numbering=0, number=number, vectors=vectors, jobs=jobs, cancels=cancels, verdicts=()
-    )
-
-
-def test_jobs_come_out_in_order_with_their_vector():
-    backlog = Backlog(SPEC)
-    backlog.add_batch(batch(1, (job(0), job(1))))
-    assert [backlog.take(1), backlog.take(5), backlog.take(1)] == [[(job(0), VECTOR)], [(job(1), VECTOR)], []]
-
-
-def test_drives_between_dreams_are_taken_together_and_by_their_own_number():
+def test_jobs_come_out_in_order_up_to_a_number_and_drives_between_dreams_up_to_their_own():
     backlog = Backlog(SPEC)
     drives = [job(number, driven=True) for number in (1, 3, 5)]
-    backlog.add_batch(batch(1, (job(0), drives[0], job(2), job(6, "evaluate"), drives[1], job(4), drives[2])))
-    taken = [[each for each, _ in backlog.take(3, 2)] for _ in range(4)]
-    assert taken == [[job(0), job(2), job(4)], drives[:2], [job(6, "evaluate")], drives[2:]]
+    evaluation = job(6, "evaluate")
+    backlog.add_batch(batch(1, (job(0), drives[0], job(2), evaluation, drives[1], job(4), drives[2], job(7))))
+    taken = [[each for each, _ in backlog.take(3, 2)] for _ in range(6)]
+    assert taken == [[job(0), job(2), job(4)], drives[:2], [evaluation], drives[2:], [job(7)], []]
 
 
-def test_a_repeated_batch_counts_once():
-    backlog = Backlog(SPEC)
-    for _ in range(2):
-        backlog.add_batch(batch(1, (job(0),)))
-    assert backlog.take(1)
-    backlog.add_batch(batch(1, (job(0),)))
-    assert not backlog.take(1)
-
-
-def test_seen_is_the_highest_number_without_a_gap():
-    backlog = Backlog(SPEC)
-    seen = []
-    for number in (1, 3, 4, 2):
-        backlog.add_batch(batch(number))
+def test_a_repeated_batch_counts_once_and_seen_is_the_highest_number_without_a_gap():
+    backlog, seen = Backlog(SPEC), []
+    for number in (1, 1, 3, 4, 2):
+        backlog.add_batch(batch(number, (job(number),)))
         seen.append(backlog.seen)
-    assert seen == [1, 1, 1, 4]
+    assert seen == [1, 1, 1, 1, 4]
+    assert [each.episode for each, _ in backlog.take(9)] == [1, 3, 4, 2]
+    backlog.add_batch(batch(1, (job(1),)))
+    assert not backlog.take(1)
 
 
 def test_parts_of_a_vector_may_arrive_in_batches_in_any_order():
@@ -57,37 +37,25 @@ def test_parts_of_a_vector_may_arrive_in_batches_in_any_order():
     assert backlog.take(1) == [(job(0), VECTOR)]
 
 
-def test_a_cancelled_job_is_not_started():
+def test_neither_a_cancelled_job_nor_one_that_a_slot_has_is_started():
     backlog = Backlog(SPEC)
-    backlog.add_batch(batch(1, (job(0), job(1)), cancels=()))
-    backlog.add_batch(batch(2, cancels=(job(0).digest,)))
-    assert backlog.take(1) == [(job(1), VECTOR)]
+    backlog.add_batch(batch(1, (job(0), job(1), job(2))), {job(0).digest})
+    backlog.add_batch(batch(2, cancels=(job(1).digest,)))
+    assert backlog.take(5) == [(job(2), VECTOR)]
 
 
-def test_a_job_that_a_slot_has_is_not_queued_again():
-    backlog = Backlog(SPEC)
-    backlog.add_batch(batch(1, (job(0), job(1))), {job(0).digest})
-    assert backlog.take(5) == [(job(1), VECTOR)]
-
-
-def test_a_job_with_another_jobs_digest_is_refused():
-    backlog = Backlog(SPEC)
-    wrong = replace(job(0), seeds=(5,))
-    assert backlog.add_batch(batch(1, (wrong,))) == [(wrong, DAMAGED)]
-    assert not backlog.take(1)
-
-
-def test_a_job_has_the_horizon_and_patience_that_it_names():
+def test_a_job_with_the_digest_of_other_content_is_refused():
     backlog, short = Backlog(SPEC), job(1, horizon=400, patience=0)
-    renamed = [replace(short, **wrong) for wrong in ({"horizon": None}, {"patience": 1}, {"horizon": 401})]
-    assert [each for each, _ in backlog.add_batch(batch(1, (short, *renamed)))] == renamed
+    changes = ({"seeds": (5,)}, {"horizon": None}, {"horizon": 401}, {"patience": 1})
+    wrong = [replace(short, **each) for each in changes]
+    assert backlog.add_batch(batch(1, (short, *wrong))) == [(each, DAMAGED) for each in wrong]
     assert backlog.take(5) == [(short, VECTOR)]
 
 
 def test_jobs_taken_together_have_one_stage():
     named = ({}, {}, {"horizon": 400}, {"horizon": 400}, {"horizon": 400, "patience": 5}, {"patience": 5})
     backlog = Backlog(SPEC)
-    backlog.add_batch(batch(1, [job(episode, **each) for episode, each in enumerate(named)]))
+    backlog.add_batch(batch(1, (job(episode, **each) for episode, each in enumerate(named))))
     assert [[each.episode for each, _ in backlog.take(5)] for _ in range(5)] == [[0, 1], [2, 3], [4], [5], []]
 
 
@@ -123,7 +91,7 @@ def test_a_batch_number_far_ahead_is_ignored():
 def test_jobs_beyond_the_limit_are_dropped():
     backlog = Backlog(SPEC)
     for number in range(3):
-        backlog.add_batch(batch(number + 1, tuple(job(number * 500 + each) for each in range(500))))
+        backlog.add_batch(batch(number + 1, (job(number * 500 + each) for each in range(500))))
     assert len(backlog.queued) == MAX_LEASES
     backlog.clear()
     backlog.add_batch(batch(4, (job(0),)))

@@ -1,4 +1,4 @@
-"""Interrupted downloads over a real router: parts on disk stay, and the whole file is verified."""
+"""Interrupted, damaged and foreign downloads over a real router: parts on disk stay, and the whole file is verified."""
 
 import resource
 import threading
@@ -7,163 +7,164 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from dreamfleet.common.artifacts.bundle_store import BundleStore
-from dreamfleet.common.errors import BundleError
-from dreamfleet.common.protocol.codec import CountingDecoder
-from dreamfleet.common.protocol.messages import MAX_PART
+from dreamfleet.common.errors import BundleError, DownloadError
+from dreamfleet.common.protocol import keys
+from dreamfleet.common.protocol.codec import CountingDecoder, encode
+from dreamfleet.common.protocol.messages import MAX_PART, BundlePart
 from dreamfleet.common.transport.session import Network, open_session
 from dreamfleet.worker.service import bundle_fetch
-from dreamfleet.worker.service.bundle_fetch import WINDOW, fetch_bundle
+from dreamfleet.worker.service.bundle_fetch import MAX_ATTEMPTS, fetch_bundle
 from tests.support import tasks
-from tests.support.hand import DEADLINE, Hand
+from tests.support.hand import DEADLINE, Hand, stranger
 from tests.support.processes import free_port
 
 
-@pytest.fixture(scope="module")
-def bundle(small_bundle):
-    return small_bundle
+class Download:
+    """A worker's download of the small bundle, whose bytes are `content`, into a new store."""
+
+    def __init__(self, hand, session, bundle, store):
+        self.hand, self.session, self.sha256, self.store = hand, session, bundle.sha256, store
+        self.content = bundle.path.read_bytes()
+
+    def begin(self, data):
+        """Write what an earlier download left; its path."""
+        with self.store.lock_download(self.sha256) as path:
+            path.write_bytes(data)
+        return path
+
+    def fetch(self, stopped=lambda: False):
+        """The bytes of the bundle."""
+        bundle = fetch_bundle(self.session, self.hand.run, self.sha256, self.store, CountingDecoder(), stopped)
+        return None if bundle is None else bundle.path.read_bytes()
+
+    def asked(self):
+        """The offsets that were asked for since the last call."""
+        return [self.hand.offsets.get_nowait() for _ in range(self.hand.offsets.qsize())]
 
 
 @pytest.fixture(scope="module")
-def hand(bundle):
-    made = Hand(free_port(), bundle, tasks.TOY)
-    yield made
-    made.close()
-
-
-@pytest.fixture(scope="module")
-def session(hand):
-    with open_session(Network(connect=(hand.endpoint,))) as opened:
-        yield opened
-
-
-@pytest.fixture(autouse=True)
-def fresh(hand):
-    hand.damage = lambda offset, data: data
-    asked(hand)
+def link(small_bundle):
+    hand = Hand(free_port(), small_bundle, tasks.TOY)
+    with open_session(Network(connect=(hand.endpoint,))) as session:
+        yield hand, session
+    hand.close()
 
 
 @pytest.fixture
-def store(tmp_path):
-    return BundleStore(tmp_path)
+def download(link, small_bundle, tmp_path, monkeypatch):
+    monkeypatch.setattr(bundle_fetch, "PAUSE", 0.0)
+    made = Download(*link, small_bundle, BundleStore(tmp_path))
+    made.hand.damage = lambda offset, data: data
+    made.asked()
+    return made
 
 
-def begun(store, bundle, data):
-    with store.lock_download(bundle.sha256) as path:
-        path.write_bytes(data)
-    return path
-
-
-def fetch(session, hand, store, stopped=lambda: False):
-    return fetch_bundle(session, hand.run, hand.spec.bundle, store, CountingDecoder(), stopped)
-
-
-def asked(hand):
-    return [hand.offsets.get_nowait() for _ in range(hand.offsets.qsize())]
-
-
-SIZES = [0, 1, 17, MAX_PART - 1, MAX_PART, MAX_PART + 1, 3 * MAX_PART + 11, -1, None]
-
-
-@pytest.mark.parametrize("cut", SIZES)
-def test_an_interrupted_download_continues(session, hand, store, bundle, cut):
-    whole = bundle.path.read_bytes()
-    cut = len(whole) if cut is None else cut % len(whole)
-    partial = begun(store, bundle, whole[:cut])
-    fetched = fetch(session, hand, store)
-    assert fetched.path.read_bytes() == whole
-    assert fetched.sha256 == bundle.sha256
+@pytest.mark.parametrize("cut", [0, 1, MAX_PART - 1, MAX_PART, MAX_PART + 1, 3 * MAX_PART + 11, -1, None])
+def test_an_interrupted_download_continues(download, cut):
+    partial = download.begin(download.content[:cut])
+    length = partial.stat().st_size
+    assert download.fetch() == download.content
     assert not partial.exists()
-    assert min(asked(hand)) == cut, "nothing that was there is asked for again"
+    asked = list(range(length, max(len(download.content), length + 1), MAX_PART))
+    assert sorted(download.asked()) == asked, "each part once, and nothing that was there"
 
 
-@pytest.mark.parametrize("where", [0, MAX_PART, 2 * MAX_PART + 16])
-def test_a_damaged_beginning_is_fetched_again(session, hand, store, bundle, where):
-    spoilt = bytearray(bundle.path.read_bytes()[: 2 * MAX_PART + 17])
-    spoilt[where] ^= 1
-    begun(store, bundle, bytes(spoilt))
-    assert fetch(session, hand, store).path.read_bytes() == bundle.path.read_bytes()
-    offsets = asked(hand)
-    assert offsets[0] == len(spoilt)
+@pytest.mark.parametrize("cut", [0, 2 * MAX_PART + 16, None], ids=["begins wrong", "ends wrong", "is too long"])
+def test_what_is_no_beginning_of_the_bundle_is_fetched_again(download, cut):
+    right = download.content[: 2 * MAX_PART + 17]
+    wrong = download.content + b"!" if cut is None else right[:cut] + bytes([right[cut] ^ 1]) + right[cut + 1 :]
+    download.begin(wrong)
+    assert download.fetch() == download.content
+    offsets = download.asked()
+    assert offsets[0] == len(wrong)
     assert 0 in offsets
 
 
-def test_a_partial_file_longer_than_the_bundle_is_discarded(session, hand, store, bundle):
-    begun(store, bundle, bundle.path.read_bytes() + b"!")
-    assert fetch(session, hand, store).path.read_bytes() == bundle.path.read_bytes()
+def test_a_damaged_part_costs_one_more_download(download):
+    spoilt = iter([bytes(MAX_PART)[:-1] + b"!"])
+    download.hand.damage = lambda offset, data: next(spoilt, data) if offset == 2 * MAX_PART else data
+    assert download.fetch() == download.content
+    assert download.asked().count(2 * MAX_PART) == 2
 
 
-def test_short_parts_never_make_a_wrong_file(session, hand, store, bundle):
+def test_a_bundle_that_is_always_damaged_is_an_error(download):
+    download.hand.damage = lambda offset, data: data[::-1]
+    with pytest.raises(DownloadError):
+        download.fetch()
+    assert download.asked().count(0) == MAX_ATTEMPTS
+
+
+def test_wrong_parts_of_a_stranger_do_not_prevent_the_download(download):
+    total = len(download.content)
+
+    def lie(query):
+        offset = int(query.parameters.get("offset"))
+        data = bytes(min(MAX_PART, total - offset))
+        head = {"run_uid": download.hand.run_uid, "incarnation": 1, "sha256": bytes.fromhex(download.sha256)}
+        return encode(BundlePart(**head, offset=offset, total=total, data=data))
+
+    with stranger(download.hand, keys.bundle(download.hand.run, download.sha256), lie):
+        assert download.fetch() == download.content
+
+
+def test_short_parts_never_make_a_wrong_file(download):
     """Every second answer is cut, as by a coordinator that serves smaller parts."""
     short = iter([True, False] * 100)
-    hand.damage = lambda offset, data: data[: len(data) // 2] if next(short) else data
-    assert fetch(session, hand, store).path.read_bytes() == bundle.path.read_bytes()
+    download.hand.damage = lambda offset, data: data[: len(data) // 2] if next(short) else data
+    assert download.fetch() == download.content
 
 
-def test_a_stopped_download_keeps_its_parts_and_is_continued(session, hand, store, bundle):
+def test_a_stopped_download_keeps_its_parts_and_is_continued(download):
     stop = threading.Event()
-    hand.damage = lambda offset, data: stop.set() if offset >= 2 * MAX_PART else data  # no answer from here on
-    assert fetch(session, hand, store, stop.is_set) is None
-    with store.lock_download(bundle.sha256) as partial:
+    download.hand.damage = lambda offset, data: stop.set() if offset >= 2 * MAX_PART else data  # no answer from here on
+    assert download.fetch(stop.is_set) is None
+    with download.store.lock_download(download.sha256) as partial:
         kept = partial.stat().st_size
     assert kept in (MAX_PART, 2 * MAX_PART)
-    asked(hand)
-    hand.damage = lambda offset, data: data
-    assert fetch(session, hand, store).path.read_bytes() == bundle.path.read_bytes()
-    assert min(asked(hand)) == kept
+    download.asked()
+    download.hand.damage = lambda offset, data: data
+    assert download.fetch() == download.content
+    assert min(download.asked()) == kept
 
 
-def test_two_workers_of_a_host_fetch_it_once(session, hand, store, bundle):
+def test_two_workers_of_a_host_fetch_it_once(download):
     with ThreadPoolExecutor() as threads:
-        both = [threads.submit(fetch, session, hand, store) for _ in range(2)]
-        assert {each.result(DEADLINE).sha256 for each in both} == {bundle.sha256}
-    assert len([offset for offset in asked(hand) if offset == 0]) == 1
+        both = [threads.submit(download.fetch) for _ in range(2)]
+        assert {each.result(DEADLINE) for each in both} == {download.content}
+    assert download.asked().count(0) == 1
 
 
-def test_a_silent_coordinator_is_an_error_and_the_parts_stay(session, hand, store, bundle, monkeypatch):
+def test_a_silent_coordinator_is_an_error_and_the_parts_stay(download, monkeypatch):
     monkeypatch.setattr(bundle_fetch, "MAX_ROUNDS_WITHOUT_PROGRESS", 2)
     monkeypatch.setattr(bundle_fetch, "QUERY_TIMEOUT", 0.1)
-    monkeypatch.setattr(bundle_fetch, "PAUSE", 0.0)
-    partial = begun(store, bundle, bundle.path.read_bytes()[:100])
-    hand.damage = lambda offset, data: None
+    partial = download.begin(download.content[:100])
+    download.hand.damage = lambda offset, data: None
     with pytest.raises(BundleError):
-        fetch(session, hand, store)
-    assert partial.read_bytes() == bundle.path.read_bytes()[:100]
+        download.fetch()
+    assert partial.read_bytes() == download.content[:100]
 
 
-def test_a_window_of_parts_is_requested_at_once(session, hand, store, bundle):
-    fetch(session, hand, store)
-    parts = -(-bundle.path.stat().st_size // MAX_PART)
-    assert 1 < parts < WINDOW
-    assert sorted(asked(hand)) == [index * MAX_PART for index in range(parts)]
-
-
-def test_a_bundle_of_absurd_length_writes_nothing(session, hand, store, bundle, monkeypatch):
-    monkeypatch.setattr(hand, "total", lambda: 2**62)
+def test_a_bundle_of_absurd_length_writes_nothing(download, monkeypatch):
+    partial = download.begin(b"")
+    monkeypatch.setattr(download.hand, "total", lambda: 2**62)
     with pytest.raises(BundleError, match=r"4,611,686,018,427 .*268"):
-        fetch(session, hand, store)
-    with store.lock_download(bundle.sha256) as partial:
-        assert not partial.stat().st_size
+        download.fetch()
+    assert partial.read_bytes() == b""
 
 
-def test_parts_that_name_another_length_are_ignored(session, hand, store, bundle, monkeypatch):
-    monkeypatch.setattr(bundle_fetch, "PAUSE", 0.0)
-    size, asked = bundle.path.stat().st_size, iter(range(10**6))
-    monkeypatch.setattr(hand, "total", lambda: size + next(asked) % 2)
-    assert fetch(session, hand, store).path.read_bytes() == bundle.path.read_bytes()
+def test_parts_that_name_another_length_are_ignored(download, monkeypatch):
+    answers = iter(range(10**6))
+    monkeypatch.setattr(download.hand, "total", lambda: len(download.content) + next(answers) % 2)
+    assert download.fetch() == download.content
 
 
-def test_a_beginning_of_another_bundle_is_discarded(session, hand, store, bundle, random_bundle):
-    begun(store, bundle, random_bundle.path.read_bytes()[: MAX_PART + 5])
-    assert fetch(session, hand, store).path.read_bytes() == bundle.path.read_bytes()
-
-
-def test_a_full_disk_is_one_line_and_the_parts_stay(session, hand, store, bundle):
+def test_on_a_full_disk_the_parts_stay(download):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_PART + 100, hard))
     try:
         with pytest.raises(BundleError):
-            fetch(session, hand, store)
+            download.fetch()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert fetch(session, hand, store).path.read_bytes() == bundle.path.read_bytes()
-    assert MAX_PART + 100 in asked(hand)
+    assert download.fetch() == download.content
+    assert MAX_PART + 100 in download.asked()

@@ -7,51 +7,37 @@ from tests.support.samples import job
 
 
 def raised(error, depth=0):
+    """The failure of an error that is raised in this line, or, with a depth, in the one above."""
     try:
         if depth:
-            raise_deeper(error, depth)
+            raise error
         raise error
     except Exception as caught:
         return ScoringFailure.of(caught)
 
 
-def raise_deeper(error, depth):
-    if depth:
-        raise_deeper(error, depth - 1)
-    raise error
-
-
-def test_a_failure_is_logged_with_its_task_its_job_and_its_traceback():
-    logged = FailureLog().format_if_new(raised(RuntimeError("the road has ended")), "moon", [job()])
-    first, *trace = logged.splitlines()
+def test_a_failure_is_logged_with_its_task_its_first_job_and_its_traceback():
+    found = raised(RuntimeError("the road has ended"))
+    logged = [FailureLog().format_if_new(found, "moon", [job(row) for row in range(jobs)]) for jobs in range(4)]
+    first, *trace = logged[1].splitlines()
     assert re.search("moon.*RuntimeError: the road has ended .*candidate 7/2, seed 1048576", first)
     assert "Traceback" in trace[0]
     assert trace[-1] == "RuntimeError: the road has ended"
+    assert re.search(r"seed 1048576.* 2\b", logged[3])
+    assert "seed" not in logged[0].splitlines()[0]
 
 
 def test_each_kind_is_logged_once():
     failures = FailureLog()
-    assert failures.format_if_new(raised(ValueError("lap 1")), "moon", [job()])
-    assert failures.format_if_new(raised(ValueError("lap 2")), "moon", [job(1)]) is None
-    assert failures.format_if_new(raised(KeyError("lap 2")), "moon", [job(1)]), "another error of the same line"
-    assert failures.format_if_new(raised(ValueError("lap 2"), depth=1), "moon", [job(1)]), (
-        "the same error of another line"
-    )
-
-
-def test_the_first_of_several_jobs_is_named_and_the_others_are_counted():
-    logged = FailureLog().format_if_new(raised(ValueError("lap 1")), "moon", [job(), job(1), job(2)])
-    assert re.search(r"seed 1048576.* 2\b", logged)
-    assert "seed" not in FailureLog().format_if_new(raised(ValueError("lap 1")), "moon", []).splitlines()[0]
+    cases = (ValueError("lap 1"), 0, True), (ValueError("lap 2"), 0, False), (KeyError("1"), 0, True)
+    for error, depth, is_new in (*cases, (ValueError("lap 2"), 1, True)):
+        assert bool(failures.format_if_new(raised(error, depth), "moon", [job()])) == is_new
 
 
 def test_the_log_is_bounded():
     failures = FailureLog()
-    logged = [
-        failures.format_if_new(ScoringFailure(failure("text"), str(kind), "trace"), "moon", [])
-        for kind in range(2 * MAX_KINDS)
-    ]
-    assert sum(text is not None for text in logged) == MAX_KINDS
+    kinds = [ScoringFailure(failure("text"), str(kind), "trace") for kind in range(2 * MAX_KINDS)]
+    assert sum(failures.format_if_new(kind, "moon", []) is not None for kind in kinds) == MAX_KINDS
     assert len(raised(RuntimeError("x" * 100_000)).trace) == MAX_TRACE
 
 

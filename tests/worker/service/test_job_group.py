@@ -6,14 +6,13 @@ from msgspec.structs import replace
 
 from dreamfleet.worker.service.job_group import AbandonedError, score_group
 from dreamfleet.worker.tasks.api import Score
+from tests.support.rough_tasks import ERRORS
 from tests.support.samples import SPEC, VECTOR, job
 
 WORK = [(job(number), VECTOR) for number in range(3)]
 
 
 class Scorer:
-    """Returns given scores, after one step each."""
-
     def __init__(self, *scores):
         self._scores = scores
 
@@ -27,28 +26,25 @@ class Scorer:
         return list(self._scores)
 
 
-def ignore(_made):
-    pass
+def score(*scores, count=lambda _made: None):
+    return score_group(Scorer(*scores), 5, WORK, count)
 
 
-def test_each_job_has_its_own_result_and_an_equal_share_of_the_time():
-    done = score_group(Scorer(*(Score(float(number), 10 + number) for number in range(3))), 5, WORK, ignore)
+def test_each_job_has_its_own_result_in_plain_numbers_and_an_equal_share_of_the_time():
+    done = score(*(Score(np.float32(number), np.int64(10 + number)) for number in range(3)))
     assert (done.group, done.upload, done.failure) == (5, None, None)
     assert [(each.digest, each.fitness, each.steps) for each in done.results] == [
         (job(number).digest, float(number), 10 + number) for number in range(3)
     ]
+    assert {(type(each.fitness), type(each.steps)) for each in done.results} == {(float, int)}
     assert len({each.seconds for each in done.results}) == 1
 
 
 @pytest.mark.parametrize(
-    ("scores", "said"),
-    [
-        ([Score(1.0, 1)], "1 score of 3 episodes"),
-        ([Score(1.0, 1)] * 2 + [None], "AttributeError"),
-    ],
+    ("scores", "said"), [([Score(1.0, 1)], "1 score of 3 episodes"), ([Score(1.0, 1)] * 2 + [None], "AttributeError")]
 )
 def test_invalid_scores_are_the_tasks_error(scores, said):
-    done = score_group(Scorer(*scores), 5, WORK, ignore)
+    done = score(*scores)
     assert [each.fitness for each in done.results] == [None] * 3
     assert all(said in each.error.text for each in done.results)
     assert said in done.failure.trace
@@ -56,15 +52,10 @@ def test_invalid_scores_are_the_tasks_error(scores, said):
 
 @pytest.mark.parametrize("number", [float("nan"), float("inf"), 1e300])
 def test_a_fitness_that_is_no_number_is_the_error_of_its_job_alone(number):
-    done = score_group(Scorer(Score(1.0, 1), Score(number, 1), Score(2.0, 1)), 5, WORK, ignore)
+    done = score(Score(1.0, 1), Score(number, 1), Score(2.0, 1))
     assert [each.fitness for each in done.results] == [1.0, None, 2.0]
     assert done.results[1].error is not None
     assert done.failure is None
-
-
-def test_scores_of_numpy_types_become_plain_numbers():
-    done = score_group(Scorer(*[Score(np.float32(0.5), np.int64(7))] * 3), 5, WORK, ignore)
-    assert {(type(each.fitness), type(each.steps)) for each in done.results} == {(float, int)}
 
 
 def test_an_abandoned_group_has_no_results_and_no_failure():
@@ -72,17 +63,21 @@ def test_an_abandoned_group_has_no_results_and_no_failure():
         if made == 2:
             raise AbandonedError
 
-    done = score_group(Scorer(*[Score(1.0, 1)] * 3), 5, WORK, count)
+    done = score(*[Score(1.0, 1)] * 3, count=count)
     assert (done.results, done.failure) == ((), None)
 
 
-def test_steps_before_an_error_are_divided_among_the_jobs():
+@pytest.mark.parametrize("error", ERRORS)
+def test_whatever_is_raised_is_each_jobs_error_and_the_steps_before_it_are_divided(error):
     class Failing(Scorer):
         def score_all(self, episodes, on_step, spec):
             on_step(9)
-            raise RuntimeError("the road has ended")
+            raise ERRORS[error]()
 
-    done = score_group(Failing(), 5, WORK, ignore)
+    done = score_group(Failing(), 5, WORK, lambda _made: None)
     assert [each.steps for each in done.results] == [3, 3, 3]
-    assert done.failure.error.cause == "RuntimeError"
+    cause_and_kind = ("host", "host") if error in ("MemoryError", "OSError") else (error, "other")
+    assert (done.failure.error.cause, done.failure.error.kind) == cause_and_kind
+    assert error in done.failure.error.text
+    assert "\n" not in done.failure.error.text
     assert done.results == tuple(replace(each, error=done.failure.error) for each in done.results)

@@ -1,5 +1,6 @@
 """How a worker joins a run: it waits, is welcomed or is refused. Tests admission.py, config.py and worker.py."""
 
+import json
 import os
 import queue
 import re
@@ -11,33 +12,33 @@ import pytest
 from dreamfleet.common.artifacts.bundle import write_bundle
 from dreamfleet.common.errors import RefusedError, UsageError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES, fingerprint
+from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import encode_json
-from dreamfleet.common.protocol.messages import Intervals, ResultBatch, TaskSpec
+from dreamfleet.common.protocol.messages import ResultBatch, TaskSpec
 from dreamfleet.common.transport.session import Network, open_session
+from dreamfleet.worker.service.admission import find_run_with_fewest_slots
 from dreamfleet.worker.service.child import ScorerArguments
 from dreamfleet.worker.service.config import WorkerConfig
 from dreamfleet.worker.service.slot import Slot
 from dreamfleet.worker.service.worker import Worker
 from tests.support import samples, tasks
-from tests.support.hand import DEADLINE, SECOND, Hand
+from tests.support.hand import DEADLINE, SECOND, SLOW_BEATS, Hand, stranger
 from tests.support.processes import free_port
 from tests.support.stage import drained, wait_for
-
-SLOW_BEATS = Intervals(beat=60.0, repeat=0.1)  # the longest valid ones
 
 
 @dataclass(frozen=True)
 class OfTomorrow(TaskSpec):
-    """A specification with a field of a later version."""
-
     later: float = 0.5
 
 
 @pytest.mark.slow
-def test_it_waits_for_a_coordinator_that_starts_later(stage, said, cached):
+def test_it_waits_for_a_coordinator_that_starts_later_and_until_its_run_is_there(stage, said, cached):
     stage.worker()
     wait_for(said, f"tcp/127.0.0.1:{stage.port}")
-    assert stage.hand().ready().slots == 1
+    other = stage.hand(run="another")
+    wait_for(said, "run test")
+    assert stage.also(other).ready().slots == 1
 
 
 def test_a_slot_that_can_score_is_reported_at_once(stage, cached):
@@ -48,18 +49,6 @@ def test_a_slot_that_can_score_is_reported_at_once(stage, cached):
     began = monotonic()
     assert [hand.beat().capacity, hand.beat().capacity] == [0, 1]
     assert monotonic() - began < SLOW_BEATS.beat, "it waited for the next beat"
-
-
-def test_it_waits_until_its_run_is_there(stage, said, cached):
-    stage.hand(run="another")
-    stage.worker()
-    wait_for(said, "run test")
-
-
-def test_without_a_name_it_joins_the_only_run(stage, cached):
-    hand = stage.hand(run="night")
-    stage.worker(run=None)
-    assert hand.ready().slots == 1
 
 
 @pytest.mark.slow
@@ -74,12 +63,14 @@ def test_without_a_name_several_runs_are_listed_until_one_is_left(stage, said, c
     other.close()
 
 
-def test_it_says_hello_again_with_the_packages_of_the_runs_fingerprint(stage, cached):
+def test_it_says_hello_again_with_its_name_and_the_packages_of_the_runs_fingerprint(stage, cached):
     hand = stage.hand()
     hand.packages = ("numpy", "no-such-package")
-    stage.worker()
+    stage.worker(name="hostB")
     first, second = hand.hello(), hand.hello()
     assert (first.packages, second.packages) == (NUMERIC_PACKAGES, hand.packages)
+    assert first.worker == second.worker
+    assert first.worker.startswith("hostB/")
     assert "gymnasium" in first.fingerprint
     assert second.fingerprint == fingerprint(hand.packages)
     assert "gymnasium" not in second.fingerprint
@@ -102,33 +93,31 @@ def test_a_refusal_is_logged_once_for_each_reason_and_the_run_is_asked_again(sta
 
 
 def test_one_answer_of_several_is_enough_to_join(stage, cached):
-    """A stranger that claims to answer every query completely answers first, and refuses."""
     hand = stage.hand()
     refusal = replace(samples.JSON["hello-reply"], run="test", accepted=False, why="go away", remedy="far away")
-    with open_session(Network(connect=(hand.endpoint,))) as session:
-        session.declare_queryable("dreamfleet/**", lambda query: say(query, refusal), complete=True)
+    with stranger(hand, "dreamfleet/**", lambda _: encode_json(refusal)):
         stage.worker()
         assert hand.ready().slots == 1
 
 
-def say(query, reply):
-    with query:
-        query.reply(query.key_expr, encode_json(reply))
-
-
-def test_a_refusal_ends_a_worker_with_exit_when_done(stage):
-    stage.hand().refusal = ("your moon is full", "wait a week")
-    _, served = stage.worker(exit_when_done=True)
-    error = served.exception(DEADLINE)
-    assert isinstance(error, RefusedError)
-    assert re.search("your moon is full.* wait a week", str(error))
-
-
-def test_a_run_whose_task_a_later_version_describes_is_refused(stage):
+def test_a_refusal_or_a_task_that_a_later_version_describes_ends_a_worker_with_exit_when_done(stage):
     hand = stage.hand()
-    hand.spec = OfTomorrow(**vars(hand.spec))
-    _, served = stage.worker(exit_when_done=True)
-    assert isinstance(served.exception(DEADLINE), RefusedError)
+    hand.refusal = ("your moon is full", "wait a week")
+    assert isinstance(error := stage.error(), RefusedError)
+    assert re.search("your moon is full.* wait a week", str(error))
+    hand.refusal, hand.spec = None, OfTomorrow(**vars(hand.spec))
+    assert isinstance(stage.error(), RefusedError)
+
+
+@pytest.mark.slow
+def test_it_asks_again_for_a_bundle_that_arrived_damaged(stage, said):
+    hand = stage.hand()
+    hand.damage = lambda offset, data: data[::-1]
+    stage.worker()
+    for _ in range(4):  # three times, and that it asks again
+        wait_for(said, hand.spec.bundle[:12])
+    hand.damage = lambda offset, data: data
+    assert hand.ready().slots == 1
 
 
 @pytest.mark.parametrize(
@@ -148,61 +137,46 @@ def test_with_any_a_run_that_refuses_or_cannot_be_scored_is_skipped(stage, said,
     other.ready()
 
 
-def test_a_name_is_its_identity_in_the_run(stage, cached):
-    hand = stage.hand()
-    stage.worker(name="hostB")
-    assert hand.hello().worker.startswith("hostB/")
-
-
-def test_an_invalid_name_is_refused():
+def test_settings_that_no_worker_can_have_are_an_error_at_once():
     with pytest.raises(UsageError, match="'big host'"):
         WorkerConfig(name="big host")
-
-
-def test_a_task_that_is_given_and_cannot_be_loaded_is_an_error_at_once():
+    with pytest.raises(UsageError, match=r"--runs.*64"):
+        WorkerConfig(any=True, runs=0)
     with pytest.raises(UsageError, match=r"'tests\.support\.tasks:Moon'"):
         Worker(WorkerConfig(), Network(), ("tests.support.tasks:Moon",))
 
 
-def foreign(tmp_path, monkeypatch):
-    """A module that writes a file when it is imported, and that file."""
+@pytest.fixture
+def mark(tmp_path, monkeypatch):
+    """A file that a module writes when it is imported."""
     mark = tmp_path / "imported"
     (tmp_path / "foreign_world.py").write_text(
         f"open({str(mark)!r}, 'w').close()\ndef World():\n    raise SystemExit\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
     return mark
 
 
 @pytest.mark.parametrize("task", ["foreign_world:World", "gym:foreign_world:X-v0"])
-def test_a_task_that_it_did_not_announce_is_never_imported(stage, cached, tmp_path, monkeypatch, task):
-    mark = foreign(tmp_path, monkeypatch)
+def test_neither_a_worker_nor_its_child_imports_a_task_that_it_did_not_announce(stage, cached, mark, task):
     stage.hand(task)
-    _, served = stage.worker(exit_when_done=True)
-    assert isinstance(error := served.exception(DEADLINE), RefusedError)
+    assert isinstance(error := stage.error(), RefusedError)
     assert re.search(rf"--task\W+{re.escape(task)}", str(error))
-    assert not mark.exists()
-
-
-@pytest.mark.parametrize("task", ["foreign_world:World", "gym:foreign_world:X-v0"])
-def test_a_child_imports_no_task_that_its_worker_did_not_announce(tmp_path, monkeypatch, task):
-    mark, events = foreign(tmp_path, monkeypatch), queue.SimpleQueue()
-    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    events = queue.SimpleQueue()
     slot = Slot(0, ScorerArguments(TaskSpec(task, "", 100, 0), None, (tasks.TOY, "gym")), events)
-    failure = events.get(timeout=DEADLINE)[1].failure
-    assert failure.error.cause == "RefusedError"
+    assert events.get(timeout=DEADLINE)[1].failure.error.cause == "RefusedError"
     slot.stop()
     assert not mark.exists()
 
 
-def test_a_world_model_of_an_unannounced_task_imports_nothing(stage, tmp_path, monkeypatch):
-    mark, small = foreign(tmp_path, monkeypatch), stage.bundle
+def test_a_world_model_of_an_unannounced_task_imports_nothing(stage, tmp_path, mark):
+    small = stage.bundle
     parts = {name: small.read(name) for name in small.manifest.parts}
     world = replace(small.manifest, task="foreign_world:World", world=small.manifest.facts)
     stage.bundle = write_bundle(tmp_path / "foreign.zip", world, parts)
     stage.hand("dream")
-    _, served = stage.worker(exit_when_done=True)
-    assert isinstance(served.exception(DEADLINE), RefusedError)
+    assert isinstance(stage.error(), RefusedError)
     assert not mark.exists()
 
 
@@ -218,3 +192,25 @@ def test_it_sends_its_host_class_once_a_child_has_determined_it(stage, cached):
     hand.nonce = SECOND
     hand.appear()
     assert hand.hello().host_class == beat.host_class
+
+
+ODD = [
+    *({"slots": slots} for slots in ("1e999", "1" + 400 * "0", "NaN", "[]")),
+    {"share": "NaN"},
+    *({"run": json.dumps(name)} for name in ("", "a#b", "*", "\ud800", ["odd"])),
+]
+
+
+def test_odd_statuses_of_other_runs_keep_no_worker_from_a_run():
+    """A name that no key may contain raised where the run was asked."""
+    good = {"state": '"running"', "run": '"good"', "slots": "3", "share": "1.0"}
+    answers = [good, *({**good, "run": '"odd"', "slots": "400", **odd} for odd in ODD)]
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with open_session(Network(listen=(endpoint,))) as served, open_session(Network(connect=(endpoint,))) as session:
+        for number, fields in reversed(list(enumerate(answers))):
+            said = "{" + ", ".join(f'"{field}": {value}' for field, value in fields.items()) + "}"
+            key = keys.status(f"run{number}")
+            served.declare_queryable(key, lambda query, said=said: query.reply(query.key_expr, said))
+        while (found := find_run_with_fewest_slots(session)) is None:
+            pass  # the declarations are on their way
+        assert found == "good"

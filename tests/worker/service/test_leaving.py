@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-from contextlib import ExitStack
+from contextlib import nullcontext
 from datetime import timedelta
 from itertools import chain, repeat
 
@@ -16,65 +16,49 @@ from dreamfleet.worker.service.config import WorkerConfig
 from dreamfleet.worker.service.worker import Worker
 from tests.support import tasks
 from tests.support.access import Access
-from tests.support.hand import DEADLINE, SECOND, tag
+from tests.support.hand import DEADLINE
 from tests.support.processes import free_port
 from tests.support.stage import drained, wait_for
 
 
-def test_with_exit_when_done_it_leaves_when_its_coordinator_says_that_the_run_has_ended(stage, cached):
-    hand, _, served = stage.served(tasks.SLOW_TOY, exit_when_done=True)
-    hand.send(1, hand.job())
-    hand.beat(lambda beat: beat.running)
-    hand.send(0, vectors=(), ended=True)
-    assert served.result(DEADLINE) is None
+@pytest.mark.parametrize("stopped", [False, True])
+def test_it_leaves_and_says_why_when_it_is_stopped_or_its_coordinator_ends_the_run(stage, cached, stopped):
+    hand, made, served = stage.served(tasks.SLOW_TOY, exit_when_done=not stopped)
+    if stopped:
+        made.stop()
+    else:
+        hand.send(1, hand.job())
+        hand.beat(lambda beat: beat.running)
+        hand.send(0, vectors=(), ended=True)
     hand.beat(lambda beat: beat.reason)
+    assert served.result(DEADLINE) is None
 
 
-@pytest.mark.parametrize("back", ["the same life", "the next life"])
-def test_with_exit_when_done_it_keeps_its_results_for_a_coordinator_that_comes_back(stage, cached, monkeypatch, back):
-    monkeypatch.setattr(membership, "NEXT_RUN_AFTER", 0.0)
-    hand, _, served = stage.served(tasks.SLOW_TOY, exit_when_done=True)
-    job = hand.job()
-    hand.send(1, job)
-    hand.beat(lambda beat: beat.running)
-    hand.vanish()
-    hand.beat(lambda beat: tag(job) in beat.unacked)
-    assert not served.done()
-    if back == "the next life":
-        hand.nonce, hand.incarnation = SECOND, 2
-    hand.appear()
-    hand.hello()
-    assert hand.result(job).fitness is not None
-    assert not served.done()
-
-
-@pytest.mark.parametrize("when", ["before it joined", "afterwards"])
-def test_with_exit_when_done_it_fails_after_long_without_a_coordinator_and_says_what_is_lost(stage, said, cached, when):
+@pytest.mark.parametrize("joined", [False, True])
+def test_with_exit_when_done_it_fails_after_long_without_a_coordinator_and_says_what_is_lost(stage, cached, joined):
     hand = stage.hand()
-    if when == "before it joined":
+    if not joined:
         hand.vanish()
     _, served = stage.worker(exit_when_done=True, coordinator_timeout=0.5)
     hand.hello()
-    if when == "afterwards":
+    if joined:
         hand.beat(lambda beat: beat.capacity > 0)
         hand.send(1, hand.job())
         hand.result(hand.job())
         hand.vanish()
     error = served.exception(DEADLINE)
     assert isinstance(error, ConnectionFailedError)
-    assert ("1 finished result" in str(error)) == (when == "afterwards")
+    assert ("1 finished result" in str(error)) == joined
     assert "--coordinator-timeout" in str(error)
 
 
-@pytest.mark.parametrize("there", ["nobody", "a router"])
-def test_with_exit_when_done_it_also_ends_where_no_coordinator_ever_let_it_in(there):
+@pytest.mark.parametrize("listens", [False, True])
+def test_with_exit_when_done_it_also_ends_where_no_coordinator_ever_let_it_in(listens):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     config = WorkerConfig(slots=1, exit_when_done=True, coordinator_timeout=0.1)
-    with ExitStack() as stack:
-        if there == "a router":
-            stack.enter_context(open_session(Network(listen=(endpoint,))))
-        with pytest.raises(ConnectionFailedError, match=r"--coordinator-timeout"):
-            Worker(config, Network(connect=(endpoint,))).serve()
+    router = open_session(Network(listen=(endpoint,))) if listens else nullcontext()
+    with router, pytest.raises(ConnectionFailedError, match=r"--coordinator-timeout"):
+        Worker(config, Network(connect=(endpoint,))).serve()
 
 
 def test_a_worker_that_a_secured_router_shows_nothing_says_so_once(stage, said, cached, monkeypatch):
@@ -88,32 +72,25 @@ def test_a_worker_that_a_secured_router_shows_nothing_says_so_once(stage, said, 
     wait_for(said, "shut out")
 
 
-def test_it_says_to_its_coordinator_why_it_leaves(stage, cached):
-    hand, made, served = stage.served()
-    made.stop()
-    hand.beat(lambda beat: beat.reason)
-    assert served.result(DEADLINE) is None
-
-
 def test_it_says_why_it_fails_before_it_can_score(stage):
     hand = stage.hand()
     hand.total = lambda: 1 << 60
-    _, served = stage.worker(exit_when_done=True)
-    error = served.exception(DEADLINE)
-    said = hand.beat()
+    error, said = stage.error(), hand.beat()
     assert (said.capacity, said.reason) == (0, str(error))
 
 
-def test_stopped_once_it_finishes_running_jobs_and_delivers(stage, cached):
+def test_stopped_once_it_finishes_running_jobs_and_delivers_and_all_others_go_back(stage, cached):
     hand, made, served = stage.served(tasks.SLOW_TOY)
-    running, queued = hand.job(0), hand.job(1)
+    running, queued, late = (hand.job(number) for number in range(3))
     hand.send(1, running, queued)
     hand.beat(lambda beat: beat.running)
     made.stop()
     assert hand.beat(lambda beat: beat.capacity == 0).queued == ()
+    hand.send(2, late)
+    assert hand.beat(lambda beat: beat.seen == 2).queued == ()
     assert hand.result(running).fitness is not None
     assert not served.done()
-    hand.send(2, accepted=(running,))
+    hand.send(3, accepted=(running,))
     assert served.result(DEADLINE) is None
 
 
@@ -124,17 +101,6 @@ def test_stopped_once_it_abandons_a_download(stage):
     hand.offsets.get(timeout=DEADLINE)
     made.stop()
     assert served.result(2) is None
-
-
-def test_jobs_that_arrive_while_it_drains_go_back(stage, cached):
-    hand, made, _ = stage.served(tasks.SLOW_TOY)
-    running, late = hand.job(0), hand.job(1)
-    hand.send(1, running)
-    hand.beat(lambda beat: beat.running)
-    made.stop()
-    hand.beat(lambda beat: beat.capacity == 0)
-    hand.send(2, late)
-    assert hand.beat(lambda beat: beat.seen == 2).queued == ()
 
 
 @pytest.mark.parametrize("coordinator", [False, True])

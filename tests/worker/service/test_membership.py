@@ -2,14 +2,11 @@
 
 import math
 
-import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from dreamfleet.worker.service.membership import (
-    FIRST_DELAY,
-    MAX_DELAY,
     NEXT_RUN_AFTER,
     NEXT_RUN_PATIENCE,
     SEARCH_INTERVAL,
@@ -26,9 +23,6 @@ BEAT = 1.0
 PATIENCE = SILENT_BEATS * BEAT
 TIMEOUT = 60.0  # of a coordinator out of sight
 IDLE = WorkerLoad(idle=True, awaits_verdict=False, uploading=False)
-BUSY = WorkerLoad(idle=False, awaits_verdict=False, uploading=False)
-OWED = WorkerLoad(idle=False, awaits_verdict=True, uploading=False)
-UPLOADING = WorkerLoad(idle=True, awaits_verdict=True, uploading=True)
 
 
 def joined(visible=True, **terms):
@@ -49,22 +43,12 @@ def test_it_leaves_a_run_that_ends_at_once_and_not_the_next_one():
     assert not member.find_end(3.0, busy=False)
 
 
-@pytest.mark.parametrize(("hands", "after"), [(IDLE, PATIENCE), (OWED, PATIENCE), (UPLOADING, PATIENCE + UPLOAD_GRACE)])
-def test_silence_of_a_coordinator_that_owes_an_answer_makes_it_say_hello(hands, after):
-    member = joined()
-    assert not member.must_rejoin(after, hands)
-    assert member.must_rejoin(after + 0.1, hands)
-
-
-def test_it_says_hello_when_the_coordinator_is_back_in_sight():
+def test_a_coordinator_is_back_if_it_is_in_the_same_life():
     member = joined()
     member.remove_coordinator("first", 1.0)
-    assert not member.must_rejoin(1.0, BUSY)
-    assert member.add_coordinator("first")
-    assert not member.add_coordinator("first")
-    assert member.must_rejoin(1.0, BUSY)
+    assert [member.add_coordinator("first") for _ in range(2)] == [True, False]
     member.remove_coordinator("first", 1.0)
-    assert not member.add_coordinator("second"), "another life"
+    assert not member.add_coordinator("second")
 
 
 def test_it_looks_for_its_run_in_intervals_while_no_coordinator_is_in_sight():
@@ -75,18 +59,6 @@ def test_it_looks_for_its_run_in_intervals_while_no_coordinator_is_in_sight():
     assert member.start_search_if_due(1e6 + SEARCH_INTERVAL)
     assert not member.start_search_if_due(1e6 + SEARCH_INTERVAL)
     assert member.start_search_if_due(1e6 + 2 * SEARCH_INTERVAL)
-
-
-def test_stopped_once_it_drains_until_all_is_delivered():
-    member = joined(drain_timeout=30.0)
-    assert not member.start_draining_if_due(1.0)
-    member.stop()
-    assert member.start_draining_if_due(1.0)
-    assert not member.start_draining_if_due(1.1), "it begins once"
-    assert (member.is_leaving(1.1), member.draining) == (True, True)
-    assert not member.find_end(30.9, busy=True)
-    assert member.find_end(1.1, busy=False)
-    assert member.find_end(31.1, busy=True), "but not for ever"
 
 
 def test_it_drains_at_the_end_of_its_lifetime_which_begins_before_any_run():
@@ -106,21 +78,15 @@ def test_it_drains_once_its_join_file_ends_by_the_wall_clock_however_little_time
     assert member.start_draining_if_due(1.0)
 
 
-@pytest.mark.parametrize("seen", [True, False])
-def test_a_worker_that_leaves_with_its_run_gives_up_a_coordinator_only_after_long_patience(seen):
-    leaves = joined(visible=seen, leaves_with_run=True, coordinator_timeout=TIMEOUT)
-    stays = joined(visible=seen, coordinator_timeout=TIMEOUT)
-    since = 1e6 if seen else 0.0
+def test_only_a_worker_that_leaves_with_its_run_gives_its_coordinator_up_and_only_after_long_patience():
+    leaves, stays = joined(leaves_with_run=True, coordinator_timeout=TIMEOUT), joined(coordinator_timeout=TIMEOUT)
     for member in (leaves, stays):
-        if seen:
-            assert not member.find_end(1e6, busy=False)
-            member.remove_coordinator("first", 1e6)
-        member.remove_coordinator("never seen", since + 1.0)  # losing a token twice does not restart the clock
-        assert not member.find_end(since + TIMEOUT, busy=True)
-        assert not member.find_end(since + TIMEOUT, busy=False), "it waits for a restart although it has nothing"
-        assert not member.gives_up(since + TIMEOUT)
-    assert leaves.find_end(since + TIMEOUT + 0.1, busy=True)
-    assert leaves.gives_up(since + TIMEOUT + 0.1)
+        assert not member.find_end(1e6, busy=False)
+        member.remove_coordinator("first", 1e6)
+        assert not member.find_end(1e6 + TIMEOUT, busy=False), "it waits for a restart although it has nothing"
+        assert not member.gives_up(1e6 + TIMEOUT)
+    assert leaves.find_end(1e6 + TIMEOUT + 0.1, busy=True)
+    assert leaves.gives_up(1e6 + TIMEOUT + 0.1)
     assert not stays.find_end(math.inf, busy=False)
     leaves.add_coordinator("second")
     assert not leaves.find_end(math.inf, busy=True)
@@ -136,48 +102,32 @@ def test_a_worker_of_any_run_goes_on_soon_but_not_at_once_with_results():
     assert not member.gives_up(math.inf), "that is no failure"
 
 
-def test_a_drained_worker_names_why():
-    stopped, expired = joined(drain_timeout=30.0), joined(lifetime=1.0)
-    stopped.stop()
-    for member in (stopped, expired):
-        assert member.start_draining_if_due(1.0)
-    assert stopped.find_end(2.0, busy=False) != expired.find_end(2.0, busy=False)
-    assert "--drain-timeout" in stopped.find_end(32.0, busy=True)
-    assert expired.find_end(2.0, busy=False)
+def test_stopped_once_it_drains_until_all_is_delivered_and_names_why():
+    member, expired = joined(drain_timeout=30.0), joined(lifetime=1.0)
+    assert not member.start_draining_if_due(1.0)
+    member.stop()
+    for each in (member, expired):
+        assert each.start_draining_if_due(1.0)
+        assert not each.start_draining_if_due(1.1), "it begins once"
+        assert (each.is_leaving(1.1), each.draining) == (True, True)
+    assert not member.find_end(30.9, busy=True)
+    assert "" != expired.find_end(1.1, busy=False) != member.find_end(1.1, busy=False) != ""
+    assert "--drain-timeout" in member.find_end(31.1, busy=True)
 
 
-def test_a_run_that_refused_is_asked_again_with_growing_pauses():
-    refusals, now, pauses = RefusalBackoff(), 0.0, []
-    for _ in range(10):
-        pauses.append(refusals.add("night", now))
-        assert refusals.refusing_runs(now + pauses[-1] - 0.1) == {"night"}
-        now += pauses[-1]
+def test_runs_that_refused_are_asked_again_each_with_its_own_growing_pauses_until_it_accepts():
+    refusals, now = RefusalBackoff(*SINGLE_RUN_DELAYS), 0.0
+    for pause in (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0):
+        assert refusals.add("night", now) == pause
+        assert refusals.refusing_runs(now + pause - 0.1) == {"night"}
+        now += pause
         assert refusals.refusing_runs(now) == set()
-    assert pauses[:3] == [FIRST_DELAY, 2 * FIRST_DELAY, 4 * FIRST_DELAY]
-    assert pauses[-1] == MAX_DELAY
-
-
-def test_each_run_has_its_own_pause():
-    refusals = RefusalBackoff()
-    refusals.add("night", 0.0)
-    refusals.add("night", FIRST_DELAY)
-    refusals.add("day", FIRST_DELAY)
-    assert refusals.refusing_runs(2 * FIRST_DELAY - 0.1) == {"night", "day"}
-    assert refusals.refusing_runs(2 * FIRST_DELAY + 0.1) == {"night"}
-
-
-def test_a_reason_is_news_once_and_again_after_another_one():
-    refusals = RefusalBackoff()
+    assert [refusals.add(run, now) for run in ("day", "night")] == [1.0, 60.0]
     assert [refusals.is_news("night", why) for why in "aabba"] == [True, False, True, False, True]
     assert refusals.is_news("day", "a")
-
-
-def test_a_run_that_accepted_the_worker_has_the_shortest_pause_again():
-    refusals = RefusalBackoff(*SINGLE_RUN_DELAYS)
-    assert [refusals.add("night", 0.0) for _ in range(8)] == [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 60.0, 60.0]
     refusals.forget("night")
-    assert refusals.refusing_runs(0.0) == set()
-    assert refusals.add("night", 0.0) == 1.0
+    assert refusals.refusing_runs(now) == {"day"}
+    assert refusals.add("night", now) == 1.0
 
 
 class AnyOrder(RuleBasedStateMachine):
@@ -189,12 +139,8 @@ class AnyOrder(RuleBasedStateMachine):
     def __init__(self):
         super().__init__()
         self.now = 0.0
-        self.terms = LeaveConditions(
-            lifetime=200.0, drain_timeout=30.0, leaves_with_run=True, coordinator_timeout=TIMEOUT
-        )
-        self.member = joined(
-            visible=False, lifetime=200.0, drain_timeout=30.0, leaves_with_run=True, coordinator_timeout=TIMEOUT
-        )
+        terms = {"lifetime": 200.0, "drain_timeout": 30.0, "leaves_with_run": True, "coordinator_timeout": TIMEOUT}
+        self.terms, self.member = LeaveConditions(**terms), joined(visible=False, **terms)
         self.seen, self.of, self.doubt = set(), "first", False
         self.spoke = self.alone = self.allowed = 0.0
         self.stops = self.drains = 0

@@ -6,8 +6,6 @@ from concurrent.futures import wait
 import pytest
 from msgspec.structs import replace
 
-from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.service.config import WorkerConfig
 from dreamfleet.worker.service.slot_pool import SlotPool
 from tests.support import tasks
 from tests.support.hand import DEADLINE
@@ -24,28 +22,6 @@ def both(stage, cached):
     one.ready()
     two.ready()
     return one, two, made, served
-
-
-@pytest.mark.slow
-def test_it_serves_both_and_each_has_the_whole_worker_while_the_other_idles(both):
-    one = both[0]
-    for hand in both[:2]:
-        hand.send(1, hand.job())
-        assert hand.result(hand.job()).fitness is not None
-        assert hand.beat().capacity == 1, "the run that idles has the slot too, once it has a job"
-    one.send(2, one.job(1), accepted=(one.job(),))
-    assert one.result(one.job(1)).fitness is not None
-
-
-@pytest.mark.slow
-def test_jobs_of_both_share_the_one_slot_and_none_fails(both):
-    one, two, *_ = both
-    jobs = [one.job(episode) for episode in range(3)]
-    one.send(1, *jobs)
-    two.send(1, *jobs)
-    one.beat(lambda beat: len(beat.running) == 1)
-    assert {job.digest for job in jobs} <= one.results(*jobs)
-    assert {job.digest for job in jobs} <= two.results(*jobs)
 
 
 def test_a_run_waits_for_budget_without_counting_as_hung(both, said):
@@ -144,8 +120,3 @@ def test_children_start_as_jobs_need_them(stage, cached):
     assert sum(slot.parked for slot in served.session._slots._slots) == 2
     one.send(1, *(one.job(episode) for episode in range(3)))
     one.beat(lambda beat: len(beat.running) > 1)
-
-
-def test_as_many_runs_as_given_are_checked():
-    with pytest.raises(UsageError, match=r"--runs.*64"):
-        WorkerConfig(any=True, runs=0)

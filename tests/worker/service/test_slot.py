@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+from contextlib import contextmanager
 from pathlib import Path
 from time import monotonic
 
@@ -19,84 +20,51 @@ from msgspec.structs import replace
 
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.worker.scoring.failure_cause import crash
-from dreamfleet.worker.service.slot import (
-    FAILED_STARTS,
-    MAX_START_DELAY,
-    START_LIMIT,
-    STARVED_STARTS,
-)
+from dreamfleet.worker.service.slot import FAILED_STARTS, MAX_START_DELAY, START_LIMIT, STARVED_STARTS
 from tests.support import tasks
 from tests.support.bundles import write_random_bundle
-from tests.support.processes import DEADLINE, environment, started
+from tests.support.processes import environment, started
 from tests.support.samples import VECTOR, job
-from tests.support.slot_harness import Harness, hash_of
+from tests.support.slot_harness import hash_of
 
 OUT_OF_MEMORY = crash(-signal.SIGKILL)
 
 
-@pytest.fixture
-def harness(random_bundle):
-    made = []
-
-    def make(task, bundle=None, memory_limit=0, **more):
-        made.append(Harness(task, bundle or random_bundle.path, memory_limit, **more))
-        return made[-1]
-
-    yield make
-    for each in made:
-        each.slot.stop()
-
-
-def test_it_scores_and_the_same_job_gives_the_same_bits(harness):
+def test_the_same_job_gives_the_same_bits_and_a_collected_rollout_is_the_drive_of_the_candidate(harness):
     slot = harness(tasks.TOY)
-    first, second, other = slot.score(), slot.score(), slot.score(1)
-    assert first.fitness is not None
-    assert first.steps == 10
-    assert first.fitness == second.fitness != other.fitness
-
-
-def test_a_collected_rollout_is_the_drive_of_the_candidate(harness):
-    slot = harness(tasks.TOY)
-    scored = slot.score()
-    slot.submit(0, kind="collect")
-    kept, file = slot.outcome()
-    assert (kept.fitness, kept.steps) == (scored.fitness, scored.steps)
-    assert kept.upload == hashlib.sha256(file).digest()
+    scored, other = slot.score(), slot.score(1)
+    assert scored.fitness != other.fitness
+    files = []
+    for _ in range(2):
+        slot.submit(0, kind="collect")
+        kept, file = slot.outcome()
+        files.append(file)
+        assert (kept.fitness, kept.steps) == (scored.fitness, scored.steps) == (scored.fitness, 10)
+        assert kept.upload == hashlib.sha256(file).digest()
+    assert files[0] == files[1], "equal drives give equal files"
     with np.load(io.BytesIO(file), allow_pickle=False) as drive:
         assert drive["reward"].sum() == pytest.approx(scored.fitness, rel=1e-5)
         assert (len(drive["picture"]), bool(drive["ended"])) == (10, True)
-    slot.submit(0, kind="collect")
-    assert slot.outcome()[1] == file, "equal drives give equal files"
-
-
-def test_a_failed_collection_is_an_error_without_a_file(harness):
-    slot = harness(tasks.RAISING)
-    slot.wait_ready()
-    slot.submit(0, kind="collect")
-    failed, file = slot.outcome()
-    assert (failed.fitness, failed.upload, file) == (None, None, None)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("task", "cause"), [(tasks.RAISING, "RuntimeError"), (tasks.NAN, "ValueError")])
-def test_an_exception_in_a_fresh_child_is_the_jobs_error(harness, task, cause):
-    slot = harness(task)
-    slot.wait_ready()
-    first = slot.slot.pid
-    pids = []
+def test_an_exception_in_a_fresh_child_is_the_jobs_error(harness):
+    slot = harness(tasks.RAISING).wait_ready()
+    pids = [slot.slot.pid]
+    slot.submit(0, kind="collect")
+    failed, file = slot.outcome()
+    assert (failed.fitness, failed.upload, file) == (None, None, None)
     for _ in range(3):
-        result = slot.score()
-        assert result.fitness is None
-        assert result.error.cause == cause
         pids.append(slot.slot.pid)
-    assert pids[0] == first, "a failure in a fresh child replaces no child"
+        result = slot.score()
+        assert (result.fitness, result.error.cause) == (None, "RuntimeError")
+    assert pids[0] == pids[1], "a failure in a fresh child replaces no child"
     assert len(set(pids)) == 3
 
 
 @pytest.mark.slow
 def test_a_child_that_lives_but_closed_its_pipe_is_replaced(harness):
-    slot = harness(tasks.SILENT)
-    slot.wait_ready()
+    slot = harness(tasks.SILENT).wait_ready()
     pid = slot.slot.pid
     assert slot.score().error.kind == "crash"
     with pytest.raises(ProcessLookupError):
@@ -111,61 +79,36 @@ def test_nobody_reads_from_a_slot_that_was_stopped(harness):
     assert threading.active_count() == before - 1
 
 
-def test_an_abandoned_job_has_no_result_and_the_child_lives_on(harness):
-    slot = harness(tasks.SLOW_TOY)
-    slot.wait_ready()
-    pid = slot.slot.pid
-    slot.submit(0)
-    slot.slot.abandon(job(0, spec=slot.spec).digest)
-    while slot.slot.running:
-        assert slot.slot.handle(slot.events.get(timeout=DEADLINE)[1]) == ()
-    assert slot.score(1).fitness is not None
-    assert slot.slot.pid == pid
-
-
-def test_after_short_groups_the_next_one_is_queued_in_the_child(harness):
-    slot = harness(tasks.TOY)
-    slot.wait_ready()
+def test_after_short_groups_the_next_one_is_queued_in_the_child_if_its_vectors_fit_in_the_pipe(harness):
+    slot = harness(tasks.TOY).wait_ready()
     assert not slot.slot.can_queue_another
     slot.score()
     for number in (1, 2):
-        slot.slot.submit([(job(number, spec=slot.spec), VECTOR)])
+        slot.submit(number)
         assert slot.slot.can_queue_another == (number == 1)
     assert [each.digest for each in slot.slot.waiting] == [job(2, spec=slot.spec).digest]
     assert [slot.result().digest for _ in range(2)] == [job(number, spec=slot.spec).digest for number in (1, 2)]
+    assert slot.score(3, vector=bytes(60_000)).fitness is not None
+    slot.submit(4)
+    assert not slot.slot.can_queue_another
 
 
-@pytest.mark.slow
-def test_after_a_crash_the_next_child_gets_the_queued_group(harness):
-    slot = harness(tasks.SLOW_TOY)
-    slot.wait_ready()
-    slot.submit(0, 1)
-    os.kill(slot.slot.pid, signal.SIGKILL)
-    crashed, scored = slot.result(), slot.result()
-    assert (crashed.digest, crashed.fitness) == (job(0, spec=slot.spec).digest, None)
-    assert scored.digest == job(1, spec=slot.spec).digest
-    assert scored.fitness is not None
-
-
-def test_a_group_ends_only_when_all_its_jobs_are_abandoned(harness):
-    slot = harness(tasks.SLOW_TOY)
-    slot.wait_ready()
-    jobs = slot.submit_group(range(2))
+def test_a_group_ends_without_a_result_when_all_its_jobs_are_abandoned_and_the_child_lives_on(harness):
+    slot = harness(tasks.SLOW_TOY).wait_ready()
+    pid, jobs = slot.slot.pid, slot.submit_group(range(2))
     slot.slot.abandon(jobs[0].digest)
-    results = ()
-    while not results:
-        results = slot.slot.handle(slot.events.get(timeout=DEADLINE)[1])
-    assert [each.digest for each in results] == [each.digest for each in jobs]
+    assert [each.digest for each in slot.results()] == [each.digest for each in jobs]
     slot.slot.submit([(each, VECTOR) for each in jobs])
     for each in jobs:
         slot.slot.abandon(each.digest)
     while slot.slot.running:
-        assert slot.slot.handle(slot.events.get(timeout=DEADLINE)[1]) == ()
+        assert slot.take() == ()
+    assert slot.score(2).fitness is not None
+    assert slot.slot.pid == pid
 
 
 def test_a_hung_job_is_killed_and_its_child_replaced(harness):
-    slot = harness(tasks.HANGING)
-    slot.wait_ready()
+    slot = harness(tasks.HANGING).wait_ready()
     stalling = replace(job(0, spec=slot.spec), stall=5.0)
     slot.slot.submit([(stalling, VECTOR)])
     now = monotonic()
@@ -179,8 +122,7 @@ def test_a_hung_job_is_killed_and_its_child_replaced(harness):
 
 
 def test_a_child_over_its_memory_limit_is_replaced_between_jobs(harness):
-    slot = harness(tasks.TOY, memory_limit=1)
-    slot.wait_ready()
+    slot = harness(tasks.TOY, memory_limit=1).wait_ready()
     pid = slot.slot.pid
     assert slot.score().fitness is not None
     assert not slot.slot.ready
@@ -200,7 +142,7 @@ def test_a_child_that_cannot_start_ends_with_its_reason(harness, tmp_path):
         slot.slot.handle(last)
 
 
-def test_a_child_that_hangs_as_it_starts_is_replaced(harness):
+def test_a_child_that_hangs_as_it_starts_is_replaced_and_the_next_one_has_more_time(harness):
     slot = harness(tasks.TOY)
     pid, now = slot.slot.pid, monotonic()
     os.kill(pid, signal.SIGSTOP)
@@ -208,32 +150,37 @@ def test_a_child_that_hangs_as_it_starts_is_replaced(harness):
     slot.slot.check(now + 2 * START_LIMIT, START_LIMIT)  # the host was suspended for that time
     slot.slot.check(now + 2 * START_LIMIT + 2.0, 0.0)
     slot.slot.handle(slot.gone())
+    second = slot.slot.pid
+    slot.slot.check(monotonic() + 2 * START_LIMIT - 2.0, 0.0)
     assert slot.score().fitness is not None
-    assert slot.slot.pid != pid
+    assert slot.slot.pid == second != pid
+
+
+@contextmanager
+def without_descriptors():
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def test_a_slot_retries_without_descriptors_and_then_names_the_cause(harness, random_bundle):
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     hash_of(random_bundle.path)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
-    try:
+    with without_descriptors():
         slot = harness(tasks.TOY)
         for _ in range(FAILED_STARTS - 2):
             slot.pass_time()
         assert slot.slot.pid == 0
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     slot.pass_time()
     assert slot.score().fitness is not None
-    resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
-    try:
+    with without_descriptors():
         slot.lose()
         for _ in range(STARVED_STARTS - 2):
             slot.pass_time()
         with pytest.raises(DreamfleetError, match="--slots"):
             slot.pass_time()
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def test_children_that_end_without_a_result_are_replaced_after_growing_pauses(harness):
@@ -276,49 +223,31 @@ def test_a_short_host_is_tried_for_ten_minutes(harness):
 
 
 @pytest.mark.slow
-def test_a_host_that_stays_short_gives_its_jobs_back(harness):
-    slot = harness(tasks.SLOW_TOY)
-    slot.wait_ready()
-    slot.submit(0, 1)
-    os.kill(slot.slot.pid, signal.SIGKILL)
-    assert slot.result().error == OUT_OF_MEMORY
+def test_a_child_that_ends_as_it_starts_blames_no_job_and_a_host_that_stays_short_gives_its_jobs_back(harness):
+    slot = harness(tasks.SLOW_TOY).wait_ready()
+    for number in (0, 2):
+        slot.submit(number, number + 1)
+        os.kill(slot.slot.pid, signal.SIGKILL)
+        assert slot.result().error == OUT_OF_MEMORY
+        if number == 0:
+            os.kill(slot.slot.pid, signal.SIGKILL)  # the next child, which is starting and has the second job
+            scored = slot.result()
+            assert (scored.digest, scored.error) == (job(1, spec=slot.spec).digest, None)
+            slot.lose()
+            slot.wait_ready()  # a fresh child again, whose crash is its job's error
     kill_as_it_starts(slot, FAILED_STARTS - 1)
-    assert [each.digest for each in slot.slot.running] == [job(1, spec=slot.spec).digest]
+    assert [each.digest for each in slot.slot.running] == [job(3, spec=slot.spec).digest]
     kill_as_it_starts(slot, 1)
     assert slot.slot.running == []
     slot.pass_time()
-    assert slot.score(2).fitness is not None
+    assert slot.score(4).fitness is not None
 
 
-def test_the_time_limit_of_a_start_grows_after_a_failure(harness):
-    slot = harness(tasks.TOY)
-    os.kill(slot.slot.pid, signal.SIGSTOP)
-    slot.slot.check(monotonic() + START_LIMIT + 2.0, 0.0)
-    slot.slot.handle(slot.gone())
-    pid = slot.slot.pid
-    slot.slot.check(monotonic() + 2 * START_LIMIT - 2.0, 0.0)
-    assert slot.score().fitness is not None
-    assert slot.slot.pid == pid
-
-
-@pytest.mark.slow
-def test_a_child_that_ends_as_it_starts_blames_no_job(harness):
-    slot = harness(tasks.SLOW_TOY)
-    slot.wait_ready()
-    slot.submit(0, 1)
-    os.kill(slot.slot.pid, signal.SIGKILL)
-    assert slot.result().error == OUT_OF_MEMORY
-    os.kill(slot.slot.pid, signal.SIGKILL)  # the next child, which is starting and has the second job
-    scored = slot.result()
-    assert scored.digest == job(1, spec=slot.spec).digest
-    assert scored.fitness is not None
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signals_for_the_worker_do_not_end_a_starting_child(harness, number):
+def test_signals_for_the_worker_do_not_end_a_starting_child(harness):
     slot = harness(tasks.TOY)
     pid = slot.slot.pid
-    os.kill(pid, number)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        os.kill(pid, number)
     assert slot.score().fitness is not None
     assert slot.slot.pid == pid
 
@@ -328,31 +257,25 @@ def test_signals_for_the_worker_do_not_end_a_starting_child(harness, number):
 def test_a_child_dies_with_its_worker(random_bundle, tmp_path):
     script = tmp_path / "parent.py"
     script.write_text(
-        "import queue, sys, pathlib\n"
+        "import pathlib, sys\n"
         "from tests.support import tasks\n"
-        "from tests.support.samples import VECTOR, job\n"
-        "from tests.support.slot_harness import spec\n"
-        "from dreamfleet.worker.service.child import ScorerArguments\n"
-        "from dreamfleet.worker.service.slot import Slot\n"
+        "from tests.support.slot_harness import Harness\n"
         "if __name__ == '__main__':\n"
-        "    events = queue.SimpleQueue()\n"
-        "    path = pathlib.Path(sys.argv[1])\n"
-        "    slot = Slot(0, ScorerArguments(spec(tasks.HANGING, path), path, tasks.ALL), events)\n"
-        "    slot.handle(events.get()[1])\n"
-        "    slot.submit([(job(spec=spec(tasks.HANGING, path)), VECTOR)])\n"
-        "    print(slot.pid, slot.ready, flush=True)\n"
-        "    events.get()\n"
+        "    slot = Harness(tasks.HANGING, pathlib.Path(sys.argv[1]))\n"
+        "    slot.wait_ready()\n"
+        "    slot.submit(0)\n"
+        "    print(slot.slot.pid, flush=True)\n"
+        "    slot.events.get()\n"
     )
     command = [sys.executable, script, random_bundle.path]
     with started(command, env=environment(tmp_path), stdout=subprocess.PIPE, text=True) as parent:
-        pid, ready = parent.stdout.readline().split()
-        assert ready == "True"
-        child = os.pidfd_open(int(pid))
+        pid = int(parent.stdout.readline())
+        child = os.pidfd_open(pid)
         assert not select.select([child], [], [], 0)[0]
         parent.kill()
         died = bool(select.select([child], [], [], 10)[0])
         if not died:
-            os.kill(int(pid), signal.SIGKILL)
+            os.kill(pid, signal.SIGKILL)
         os.close(child)
         assert died, "it hangs in its job, where no closed pipe ends it"
 

@@ -1,5 +1,6 @@
 """How runs share a worker's slots, by a simulation in virtual time."""
 
+import math
 import random
 
 import pytest
@@ -8,28 +9,32 @@ from dreamfleet.worker.service.slot_budget import PATIENCE, QUANTUM, RECENT, Slo
 
 
 class Simulated:
-    """Runs whose jobs take known seconds; each has always jobs waiting unless a test says otherwise."""
+    """Runs whose jobs take known seconds; each has always jobs waiting unless it idles.
 
-    def __init__(self, slots, **runs):
-        self.now = 0.0
-        self.budget = SlotBudget(slots)
-        self.running = []  # (end, run, seconds)
-        self.used = dict.fromkeys(runs, 0.0)
-        self.seconds, self.keys, self.idle = {}, {}, set()
-        self.idled = 0.0
-        self.slots = slots
-        for number, (name, (share, seconds)) in enumerate(runs.items()):
-            self.keys[name], self.seconds[name] = number, seconds
-            self.budget.join(number, share, self.now)
+    With `candidates`, a run has its generation's jobs alone, and the next one's once the last of them has ended.
+    """
+
+    def __init__(self, slots, candidates=math.inf, **runs):
+        self.now = self.idled = 0.0
+        self.budget, self.slots, self.candidates = SlotBudget(slots), slots, candidates
+        self.running, self.idle = [], set()  # (end, run, seconds) of jobs; names of runs
+        self.used, self.left = dict.fromkeys(runs, 0.0), dict.fromkeys(runs, candidates)
+        self.keys = {name: number for number, name in enumerate(runs)}
+        self.seconds = {name: seconds for name, (_, seconds) in runs.items()}
+        for name, (share, _) in runs.items():
+            self.budget.join(self.keys[name], share, self.now)
 
     def fill(self):
-        order = list(self.keys)
-        random.Random(self.now).shuffle(order)
+        order = random.Random(self.now).sample(list(self.keys), len(self.keys))
         for name in order:
-            wanted = 0 if name in self.idle else self.slots
+            if not self.left[name] and not self.held(name):
+                self.budget.settle(self.keys[name], 0, 0, self.now, has_jobs=False)
+                self.left[name] = self.candidates
+            wanted = 0 if name in self.idle else min(self.left[name], self.slots)
             self.budget.settle(self.keys[name], self.held(name), wanted, self.now, has_jobs=wanted > 0)
         for name in order:
-            while name not in self.idle and self.budget.take(self.keys[name], self.now):
+            while self.left[name] and name not in self.idle and self.budget.take(self.keys[name], self.now):
+                self.left[name] -= 1
                 seconds = self.seconds[name]() if callable(self.seconds[name]) else self.seconds[name]
                 self.running.append((self.now + seconds, name, seconds))
 
@@ -58,31 +63,16 @@ def test_two_busy_runs_get_slot_time_by_their_shares_whatever_their_jobs_take(sl
     assert two.idled == 0
 
 
-class InGenerations(Simulated):
-    """Each run has its generation's jobs alone, and the next generation's once the last of them has ended."""
-
-    def __init__(self, candidates, *of, **runs):
-        super().__init__(*of, **runs)
-        self.candidates, self.left = candidates, dict.fromkeys(runs, candidates)
-
-    def fill(self):
-        for name in self.keys:
-            if not self.left[name] and not self.held(name):
-                self.budget.settle(self.keys[name], 0, 0, self.now, has_jobs=False)
-                self.left[name] = self.candidates
-            wanted = min(self.left[name], self.slots)
-            self.budget.settle(self.keys[name], self.held(name), wanted, self.now, has_jobs=wanted > 0)
-        for name in random.Random(self.now).sample(list(self.keys), len(self.keys)):
-            while self.left[name] and self.budget.take(self.keys[name], self.now):
-                self.left[name] -= 1
-                self.running.append((self.now + (seconds := self.seconds[name]()), name, seconds))
+def about_a_second():
+    """Draws how long jobs take."""
+    rng = random.Random(1)
+    return lambda: rng.uniform(0.5, 1.5)
 
 
 @pytest.mark.parametrize("candidates", [16, 32, 64])
 def test_gaps_between_generations_cost_no_share(candidates):
-    rng = random.Random(1)
-    seconds = lambda: rng.uniform(0.5, 1.5)  # noqa: E731
-    two = InGenerations(candidates, 4, one=(1.0, seconds), other=(3.0, seconds))
+    seconds = about_a_second()
+    two = Simulated(4, candidates, one=(1.0, seconds), other=(3.0, seconds))
     two.run(3000)
     assert two.used["other"] / two.used["one"] == pytest.approx(3, rel=0.1)
 
@@ -99,12 +89,9 @@ def test_the_least_share_is_a_run_in_the_background_that_never_starves(slots):
 
 
 def test_a_run_in_the_background_fills_the_gaps_between_generations():
-    rng = random.Random(1)
-    seconds = lambda: rng.uniform(0.5, 1.5)  # noqa: E731
-    alone, two = (
-        InGenerations(64, 4, one=(1.0, seconds)),
-        InGenerations(64, 4, one=(1.0, seconds), background=(0.01, seconds)),
-    )
+    seconds = about_a_second()
+    alone = Simulated(4, 64, one=(1.0, seconds))
+    two = Simulated(4, 64, one=(1.0, seconds), background=(0.01, seconds))
     for each in (alone, two):
         each.run(1000)
     assert two.used["one"] > 0.95 * alone.used["one"]
@@ -135,16 +122,6 @@ def test_many_runs_of_random_jobs_are_shared_fairly_and_no_slot_idles():
     assert many.idled == 0
 
 
-def test_an_idle_run_saves_no_credit():
-    two = Simulated(1, one=(1.0, 0.5), other=(1.0, 0.5))
-    two.idle.add("other")
-    two.run(100)
-    two.idle.clear()
-    before = dict(two.used)
-    two.run(100)
-    assert two.used["one"] - before["one"] == pytest.approx(50, abs=2)
-
-
 def test_a_run_that_joins_late_owes_nothing_and_is_owed_nothing():
     budget = SlotBudget(1)
     budget.join(0, 1.0, 0.0)
@@ -158,12 +135,18 @@ def test_a_run_that_joins_late_owes_nothing_and_is_owed_nothing():
     assert budget.take(0, 1001.0), "it pays for what it used when it was alone"
 
 
-def test_short_jobs_alternate_only_once_a_run_is_ahead_by_a_quantum():
+def two_runs_of_one_slot():
+    """A budget of two runs that wait for its one slot, of which the first takes it."""
     budget = SlotBudget(1)
     for run in (0, 1):
         budget.join(run, 1.0, 0.0)
         budget.settle(run, 0, 1, 0.0, has_jobs=True)
     assert budget.take(0, 0.0)
+    return budget
+
+
+def test_short_jobs_alternate_only_once_a_run_is_ahead_by_a_quantum():
+    budget = two_runs_of_one_slot()
     assert budget.goes_on(0, QUANTUM / 2)
     assert not budget.goes_on(0, QUANTUM * 1.1)
     budget.settle(0, 0, 1, QUANTUM * 1.1, has_jobs=True)
@@ -172,11 +155,7 @@ def test_short_jobs_alternate_only_once_a_run_is_ahead_by_a_quantum():
 
 
 def test_a_run_that_does_not_take_its_turn_is_passed_over():
-    budget = SlotBudget(1)
-    for run in (0, 1):
-        budget.join(run, 1.0, 0.0)
-        budget.settle(run, 0, 1, 0.0, has_jobs=True)
-    assert budget.take(0, 0.0)
+    budget = two_runs_of_one_slot()
     budget.settle(0, 0, 1, 5.0, has_jobs=True)
     assert not budget.take(0, 5.0)
     assert budget.take(0, 5.0 + 1.1 * PATIENCE)
@@ -201,6 +180,11 @@ def test_what_a_run_can_count_on_is_its_part_and_what_the_others_leave():
     assert budget.allowance(0, 3.0 + 2 * RECENT) == 8
     budget.leave(1, 9.0)
     assert budget.allowance(0, 9.0) == 8
+    single = SlotBudget(1)
+    for run in range(5):
+        single.join(run, 1.0, 0.0)
+        single.settle(run, 0, 1, 0.0, has_jobs=True)
+    assert {single.allowance(run, 0.0) for run in range(5)} == {1}, "each counts on the one slot"
 
 
 def test_what_a_run_could_use_at_once_is_what_the_others_neither_hold_nor_wait_for():
@@ -212,11 +196,3 @@ def test_what_a_run_could_use_at_once_is_what_the_others_neither_hold_nor_wait_f
     assert budget.usable(0) == 1
     budget.settle(0, 2, 0, 0.0, has_jobs=True)
     assert budget.usable(0) == 2, "what it holds it can use"
-
-
-def test_in_one_slot_every_run_counts_on_a_slot():
-    budget = SlotBudget(1)
-    for run in range(5):
-        budget.join(run, 1.0, 0.0)
-        budget.settle(run, 0, 1, 0.0, has_jobs=True)
-    assert {budget.allowance(run, 0.0) for run in range(5)} == {1}

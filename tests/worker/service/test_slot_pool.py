@@ -1,26 +1,22 @@
 """How the jobs of a backlog are divided among a worker's slots."""
 
-import math
 import queue
-from time import sleep
 
 import numpy as np
 import pytest
 
-from dreamfleet.common.errors import DreamfleetError
-from dreamfleet.common.protocol.messages import JobBatch, TaskSpec, VectorPart
+from dreamfleet import DreamfleetError, Scorer
+from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.scoring.drive_count import ENOUGH
-from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.service import slot_pool
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.child import ScorerArguments
 from dreamfleet.worker.service.slot_budget import SharedSlots
-from dreamfleet.worker.service.slot_pool import SlotPool
+from dreamfleet.worker.service.slot_pool import BATCH_INTERVAL, SlotPool
 from tests.support import rough_tasks, tasks
 from tests.support.processes import DEADLINE
-from tests.support.samples import HEAD, VECTOR, VECTOR_ID, job
+from tests.support.samples import VECTOR, batch, job
 
-WHOLE = VectorPart(id=VECTOR_ID, dtype="<f4", shape=(16,), offset=0, data=VECTOR)
 SIDE_BY_SIDE = f"{tasks.MODULE}:SideBySide"
 
 
@@ -38,13 +34,7 @@ class Pool:
         return self.slots.handle(self.events.get(timeout=DEADLINE)[1])
 
     def add(self, jobs):
-        """Put jobs into the backlog, as one batch."""
-        number = self.backlog.seen + 1
-        self.backlog.add_batch(
-            JobBatch(
-                **HEAD, nonce="n", numbering=0, number=number, vectors=(WHOLE,), jobs=jobs, cancels=(), verdicts=()
-            )
-        )
+        self.backlog.add_batch(batch(self.backlog.seen + 1, jobs))
 
     def score(self, count):
         """So many jobs, their fitness by digest, and the sizes of the groups in the order in which they began."""
@@ -99,10 +89,6 @@ def test_a_slot_finds_from_its_drives_how_many_it_should_do_side_by_side(pool, m
     assert (fleet.slots.together, fleet.slots.capacity) == (2, 2)
 
 
-def test_a_few_jobs_go_to_as_many_slots(pool):
-    assert pool(SIDE_BY_SIDE).score(2)[2] == [1, 1]
-
-
 @pytest.mark.parametrize("task", [f"{rough_tasks.MODULE}:OnlyOne", f"{tasks.MODULE}:OneByOne"])
 def test_without_a_second_environment_or_such_a_policy_jobs_are_scored_one_by_one(pool, task):
     fleet = pool(task)
@@ -110,40 +96,32 @@ def test_without_a_second_environment_or_such_a_policy_jobs_are_scored_one_by_on
     assert fleet.score(5)[2] == [1] * 5
 
 
-def test_on_a_torch_device_a_part_of_a_batch_waits_for_the_rest_that_arrives(pool, monkeypatch):
-    monkeypatch.setattr(slot_pool, "BATCH_INTERVAL", math.inf)
-    monkeypatch.setattr(slot_pool, "LONGEST_WAIT", math.inf)
-    fleet = pool(f"{tasks.MODULE}:OnTorch", slots=1, torch_device="cpu")
+def test_on_a_torch_device_a_part_of_a_batch_waits_for_the_rest_that_arrives_but_not_for_ever(pool, monkeypatch):
+    fleet, now, brief = pool(f"{tasks.MODULE}:OnTorch", slots=1, torch_device="cpu"), [0.0], 0.9 * BATCH_INTERVAL
+    monkeypatch.setattr(slot_pool, "monotonic", lambda: now[0])
+    monkeypatch.setattr(slot_pool, "LONGEST_WAIT", 3 * BATCH_INTERVAL)
     assert fleet.slots.capacity == 8
-    jobs = [job(number, spec=fleet.spec) for number in range(16)]
     (slot,) = fleet.slots._slots
-    for part in (jobs[:3], jobs[3:6]):
-        fleet.add(tuple(part))
+
+    def fill(seconds, *numbers):
+        """Whether jobs wait, and how many are scored, after these jobs arrived so much later."""
+        now[0] += seconds
+        fleet.add(job(number, spec=fleet.spec) for number in numbers)
         fleet.slots.fill(fleet.backlog, 0)
-        assert (fleet.slots.awaits_jobs, slot.running) == (True, [])
-    fleet.slots.fill(fleet.backlog, 0)  # of another event
-    assert (fleet.slots.awaits_jobs, slot.running) == (True, [])
-    monkeypatch.setattr(slot_pool, "BATCH_INTERVAL", 0.0)
-    fleet.slots.fill(fleet.backlog, 0)  # no more came meanwhile
-    assert (fleet.slots.awaits_jobs, len(slot.running)) == (False, 6)
-    while slot.running:
-        fleet.take()
-    fleet.add(tuple(jobs[6:]))
-    fleet.slots.fill(fleet.backlog, 0)
-    assert (fleet.slots.awaits_jobs, len(slot.running), len(slot.waiting)) == (False, 8, 2)
+        return fleet.slots.awaits_jobs, len(slot.running)
 
+    def finish():
+        while slot.running:
+            fleet.take()
+        fill(0.0)
 
-def test_jobs_that_trickle_in_wait_not_for_ever(pool, monkeypatch):
-    fleet = pool(f"{tasks.MODULE}:OnTorch", slots=1, torch_device="cpu")
-    monkeypatch.setattr(slot_pool, "BATCH_INTERVAL", math.inf)
-    (slot,) = fleet.slots._slots
-    fleet.add((job(0, spec=fleet.spec),))
-    fleet.slots.fill(fleet.backlog, 0)
-    assert (fleet.slots.awaits_jobs, slot.running) == (True, [])
-    sleep(slot_pool.LONGEST_WAIT)
-    fleet.add((job(1, spec=fleet.spec),))
-    fleet.slots.fill(fleet.backlog, 0)
-    assert (fleet.slots.awaits_jobs, len(slot.running)) == (False, 2)
+    assert [fill(brief, *part) for part in ((0, 1, 2), (3, 4, 5), ())] == [(True, 0)] * 3
+    assert fill(0.2 * BATCH_INTERVAL) == (False, 6), "no more came meanwhile"
+    finish()
+    assert [fill(brief, number) for number in range(6, 11)] == [(True, 0)] * 4 + [(False, 5)], "they trickle in"
+    finish()
+    assert fill(brief, *range(11, 21)) == (False, 8)
+    assert len(slot.waiting) == 2
 
 
 def test_without_a_torch_device_no_part_of_a_batch_waits(pool):

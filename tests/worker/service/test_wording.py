@@ -21,22 +21,18 @@ def program(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("typed", "whole"),
+    ("flag", "typed", "whole"),
     [
-        (("--run", "night", "--connect", ADDRESS), f"--run night --connect {ADDRESS} --task my:World"),
-        (("--task", "a:A", "b:B", "--any"), "--any --task a:A b:B my:World"),
-        (("--task=a:A", "--slots=2"), "--slots=2 --task a:A my:World"),
-        (("--name", "it's"), "--name 'it'\"'\"'s' --task my:World"),
+        (TASK.flag, ("--run", "night", "--connect", ADDRESS), f"--run night --connect {ADDRESS} --task my:World"),
+        (TASK.flag, ("--task", "a:A", "b:B", "--any"), "--any --task a:A b:B my:World"),
+        (TASK.flag, ("--task=a:A", "--slots=2"), "--slots=2 --task a:A my:World"),
+        (TASK.flag, ("--name", "it's"), "--name 'it'\"'\"'s' --task my:World"),
+        (("--run", "day"), ("--run", "old", "--join", "f"), "--join f --run day"),  # which replaces the one named
     ],
 )
-def test_a_refusals_command_has_all_flags_that_were_typed(typed, whole):
-    assert describe_refusal(TASK, ("worker", *typed)) == f"start it: `dreamfleet worker {whole}`"
-
-
-def test_a_command_that_chooses_a_run_replaces_the_one_that_was_named():
-    error = RefusedError("choose one", ("--run", "day"))
-    typed = ("worker", "--run", "old", "--join", "f")
-    assert describe_refusal(error, typed) == "choose one: `dreamfleet worker --join f --run day`"
+def test_a_refusals_command_has_all_flags_that_were_typed(flag, typed, whole):
+    found = describe_refusal(RefusedError("start it", flag), ("worker", *typed))
+    assert found == f"start it: `dreamfleet worker {whole}`"
 
 
 def test_a_refusal_without_a_command_stays_and_a_program_names_the_lacking_flag_alone():
@@ -58,28 +54,21 @@ def test_a_worker_that_is_early_is_not_called_revoked_at_once(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("answered", "awaited", "flag"), [(True, "run night", "--connect"), (False, "a coordinator", "--listen")]
+    ("answered", "awaited", "others", "flag"),
+    [(True, "run night", r".* day$", "--connect"), (False, "a coordinator", "$", "--listen")],
 )
-def test_a_waiting_worker_names_the_address_at_once_and_what_to_start_later(answered, awaited, flag):
+def test_a_waiting_worker_names_the_address_and_what_is_there_at_once_and_what_to_start_later(
+    answered, awaited, others, flag
+):
     texts = WaitingText(WorkerConfig(run="night"), Network(connect=(ADDRESS,)), 5.0)
-    first, second = said(texts, (5.0, 6.0, 5.0 + WAIT_LIMIT, 500.0), answered=answered)
-    assert re.search(f"{awaited}.* {ADDRESS}$", first)
+    times, there = (5.0, 6.0, 5.0 + WAIT_LIMIT, 500.0), lambda: ["night", "day"]
+    first, second = said(texts, times, answered=answered, others=there)
+    assert re.search(f"{awaited}.* {ADDRESS}{others}", first)
     assert re.search(f" {ADDRESS}.* 30 .*dreamfleet coordinator --run night {flag} {ADDRESS}$", second)
 
 
-def test_a_worker_whose_run_has_ended_says_so_once():
-    texts = WaitingText(WorkerConfig(), Network(connect=(ADDRESS,)), 0.0, "run night ended after 2 generations")
+@pytest.mark.parametrize(("run", "awaited"), [(None, ""), ("night", " run night.*")])
+def test_a_worker_whose_run_has_ended_says_so_once_and_waits_for_a_named_run_alone(run, awaited):
+    texts = WaitingText(WorkerConfig(run=run), Network(connect=(ADDRESS,)), 0.0, "run night ended after 2 generations")
     (text,) = said(texts, (0.0, 1.0, 500.0), answered=False)
-    assert re.search(f"run night ended after 2 generations.* {ADDRESS}$", text)
-
-
-def test_a_worker_of_a_named_run_waits_for_it_alone():
-    texts = WaitingText(WorkerConfig(run="night"), Network(connect=(ADDRESS,)), 0.0, "run night ended: 2 generations")
-    (text,) = said(texts, (0.0, 1.0), answered=False)
-    assert re.search(f"run night ended: 2 generations.* run night.* {ADDRESS}$", text)
-
-
-def test_a_worker_that_waits_for_its_run_names_those_that_are_served_there():
-    waiting = WaitingText(WorkerConfig(run="mine"), Network(connect=("tcp/a:1",)), 0.0)
-    said = waiting.next(0.0, answered=True, others=lambda: ["mine", "night"])
-    assert re.search("run mine.* tcp/a:1.* night$", said)
+    assert re.search(f"run night ended after 2 generations.*{awaited} {ADDRESS}$", text)

@@ -5,10 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from dreamfleet import Scorer, TaskSpec, find_bundle, find_controller
-from dreamfleet.common.artifacts.actions import Continuous, Discrete
-from dreamfleet.common.artifacts.controller import ControllerShape
-from dreamfleet.common.errors import UsageError
+from dreamfleet import Continuous, ControllerShape, Discrete, Scorer, TaskSpec, UsageError, find_bundle, find_controller
 from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.tasks.measures import Measurer
 
@@ -19,36 +16,29 @@ def pole(*measures):
     return TaskSpec("gym:CartPole-v1", "", 30, 0, controller=ControllerShape(4, 2), measures=measures)
 
 
-def score(spec, parameters, seed=1, bundle=None):
-    scorer = Scorer(spec, bundle)
-    try:
-        return scorer.score("score", parameters, seed)
-    finally:
-        scorer.close()
+def score(spec, parameters, bundle=None):
+    return Scorer(spec, bundle).score("score", parameters, 1)
 
 
-def test_a_numbered_action_is_measured_by_the_share_of_its_steps():
+def test_a_numbered_action_is_measured_by_the_share_of_its_steps_which_changes_no_fitness():
     parameters = np.random.default_rng(1).normal(0, 1, 10).astype(np.float32)
-    found = score(pole("steps", "action0", "action1", "action1.share"), parameters)
+    plain, found = score(pole(), parameters), score(pole("steps", "action0", "action1", "action1.share"), parameters)
     steps, left, right, share = found.measures
     assert steps == found.steps
     assert left + right == pytest.approx(1)
     assert 0 < right == share < 1
-
-
-def test_measuring_changes_no_fitness_and_a_run_that_does_not_ask_gets_none():
-    parameters = np.zeros(10, np.float32)
-    plain, measured = score(pole(), parameters), score(pole("steps"), parameters)
-    assert plain.measures == ()
-    assert (plain.fitness, plain.steps) == (measured.fitness, measured.steps)
+    assert (plain.fitness, plain.steps, plain.measures) == (found.fitness, found.steps, ())
 
 
 @pytest.mark.parametrize(
     ("name", "named"), [("speed", "'speed'.* steps, action0, action0.abs"), ("truth.speed", "'truth.speed'")]
 )
-def test_a_measure_that_the_world_lacks_is_refused(name, named):
+def test_a_measure_that_the_world_or_the_dream_lacks_is_refused(name, named):
     with pytest.raises(UsageError, match=named):
         Scorer(pole(name))
+    bundle = find_bundle("tiny")
+    with pytest.raises(UsageError, match=name):
+        DreamBatch(bundle, TaskSpec("dream", bundle.sha256, 40, 0, measures=(name,)))
 
 
 def test_a_number_that_the_last_info_lacks_is_the_episodes_failure():
@@ -57,9 +47,9 @@ def test_a_number_that_the_last_info_lacks_is_the_episodes_failure():
 
 
 def test_a_cars_speed_is_its_true_states_mean():
-    bundle, controller = find_bundle("tiny"), find_controller("tiny")
+    bundle = find_bundle("tiny")
     spec = TaskSpec("car-racing", bundle.sha256, 60, 0, measures=("truth.speed", "gas", "brake.share"))
-    speed, gas, braking = score(spec, controller.parameters, bundle=bundle).measures
+    speed, gas, braking = score(spec, find_controller("tiny").parameters, bundle).measures
     assert 1 < speed < 100
     assert 0 < gas < 1
     assert 0 <= braking < 1
@@ -77,12 +67,6 @@ def test_a_dreams_measures_are_the_same_bits_in_any_batch():
     assert [measuring.score([each])[0] for each in dreams] == together
     assert [each.fitness for each in together] == [each.fitness for each in DreamBatch(bundle, spec).score(dreams)]
     assert all(0 <= each.measures[0] <= 1 and each.measures[3] == each.steps for each in together)
-
-
-def test_a_dream_has_no_speed():
-    bundle = find_bundle("tiny")
-    with pytest.raises(UsageError, match=r"truth\.speed"):
-        DreamBatch(bundle, TaskSpec("dream", bundle.sha256, 40, 0, measures=("truth.speed",)))
 
 
 def test_a_tally_counts_each_row_alone():

@@ -24,54 +24,37 @@ py-modules = ["field"]
 """
 
 
-@pytest.fixture(scope="module")
-def installed(tmp_path_factory):
-    """The folder that the package was installed in."""
-    page = (ROOT / "docs" / "reference" / "tasks.md").read_text()
-    (module,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    (points,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
-    assert len(module.splitlines()) - module.count("\n\n") <= 30, "thirty lines, blank ones aside"
-    source, target = tmp_path_factory.mktemp("field"), tmp_path_factory.mktemp("site")
-    (source / "field.py").write_text(module)
-    (source / "pyproject.toml").write_text(PROJECT + points)
-    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(target), str(source)]
-    subprocess.run(pip, check=True, timeout=DEADLINE, capture_output=True)
-    return target
-
-
-def run(code, *folders):
-    path = os.pathsep.join(map(str, (*folders, ROOT)))
-    done = subprocess.run(
-        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True,
-        timeout=DEADLINE, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
-
-
-@pytest.mark.slow
-def test_a_package_registers_a_task_that_needs_no_bundle(installed):
-    code = """
-from dreamfleet.common.protocol.tasks import describe_task
-from dreamfleet.worker.tasks.registry import find_task, known_tasks
-print("field" in known_tasks(), find_task("field").name, describe_task("field", {}).observations)
-"""
-    assert run(code, installed) == "True field 2"
-
-
-@pytest.mark.slow
-def test_candidates_are_scored_in_it(installed):
-    code = """
+CODE = """
 import numpy as np
 from dreamfleet import Scorer, TaskSpec
 from dreamfleet.common.artifacts.controller import ControllerShape
-shape = ControllerShape(2, 2)
-scorer = Scorer(TaskSpec("field", "", 20, 0, shape))
+from dreamfleet.common.protocol.tasks import describe_task
+from dreamfleet.worker.tasks.registry import find_task, known_tasks
+print("field" in known_tasks(), find_task("field").name, describe_task("field", {}).observations)
+scorer = Scorer(TaskSpec("field", "", 20, 0, ControllerShape(2, 2)))
 still, inwards = np.zeros(6, np.float32), np.array([-1, 0, 0, -1, 0, 0], np.float32)
 print(scorer.score("score", inwards, 3).fitness > scorer.score("score", still, 3).fitness,
       scorer.score("evaluate", inwards, 3).steps)
 """
-    assert run(code, installed) == "True 20"
+
+
+@pytest.mark.slow
+def test_a_package_registers_a_task_that_needs_no_bundle_and_candidates_are_scored_in_it(tmp_path):
+    page = (ROOT / "docs" / "reference" / "tasks.md").read_text()
+    (module,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (points,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    assert len(module.splitlines()) - module.count("\n\n") <= 30, "thirty lines, blank ones aside"
+    source, target = tmp_path / "source", tmp_path / "site"
+    source.mkdir()
+    (source / "field.py").write_text(module)
+    (source / "pyproject.toml").write_text(PROJECT + points)
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", target, source]
+    subprocess.run(pip, check=True, timeout=DEADLINE, capture_output=True)
+    surroundings = {**os.environ, "PYTHONPATH": f"{target}{os.pathsep}{ROOT}"}
+    done = subprocess.run(
+        [sys.executable, "-c", CODE], env=surroundings, capture_output=True, text=True, timeout=DEADLINE, check=False
+    )
+    assert (done.returncode, done.stdout.split()) == (0, ["True", "field", "2", "True", "20"]), done.stderr
 
 
 class Nameless(Task):

@@ -1,13 +1,9 @@
 """Tests mdnrnn_graph.py."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
-from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
-from dreamfleet.common.artifacts.controller import act
 from dreamfleet.worker.worldmodel.inference import DreamStep, PolicyStep
 from dreamfleet.worker.worldmodel.mdnrnn_config import ARTICLE, ATTENTIVE, NOTEBOOK, PAPER, REWARDED, MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -78,45 +74,6 @@ def test_the_dream_is_what_torch_dreams(tmp_path, name, temperature):
     for one, other in zip((dream.latent, dream.state, dream.reward, dream.done), expected, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-4)
     assert dream.reward.shape == dream.done.shape == (ROWS,)
-
-
-@pytest.mark.parametrize("name", ["ours", "everything"])
-@pytest.mark.parametrize("rows", [1, 3, 64, 256])
-def test_a_dreamers_bits_do_not_depend_on_who_else_dreams(tmp_path, name, rows):
-    config = VARIANTS[name]
-    step, feed = DreamStep(write_random_bundle(tmp_path / "b.zip", rnn=config)), chance(config)
-    parameters = np.random.default_rng(2).normal(0, 0.1, (ROWS, step.shape.size)).astype(np.float32)
-    del feed["action"]
-    whole = step.step(**feed, parameters=parameters, temperature=1.15)
-    order = np.random.default_rng(3).permutation(ROWS)
-    for start in range(0, ROWS - rows + 1, max(rows, 16)):
-        chosen = order[start : start + rows]
-        few = step.step(
-            **{key: each[chosen] for key, each in feed.items()}, parameters=parameters[chosen], temperature=1.15
-        )
-        assert all(np.array_equal(one, other[chosen]) for one, other in zip(few, whole, strict=True))
-
-
-@pytest.mark.parametrize("features", ["z", "zh"])
-@pytest.mark.parametrize("hidden", [0, 5])
-def test_every_controller_acts_by_its_formula_in_the_dream_and_in_reality(tmp_path, features, hidden):
-    config = replace(REWARDED, previous_reward=True)
-    bundle = write_random_bundle(tmp_path / "b.zip", rnn=config)
-    bundle = bundle.with_controllers(bundle.shape_of(features, hidden))
-    dream, policy, feed = DreamStep(bundle), PolicyStep(bundle), chance(config, rows=4)
-    random = np.random.default_rng(4)
-    parameters = random.normal(0, 0.1, (4, bundle.controller_shape.size)).astype(np.float32)
-    real = policy.step(random.integers(0, 256, (4, 64, 64, 3), dtype=np.uint8), parameters, feed["state"])
-    dreamt = dream.step(real.latent, parameters, feed["state"], feed["uniform"], feed["normal"], temperature=1.0)
-    np.testing.assert_allclose(dreamt.action, real.action, atol=2e-6)
-    seen = np.concatenate([real.latent, feed["state"][:, : config.hidden]], axis=1)[
-        :, : bundle.controller_shape.features
-    ]
-    for row in range(4):
-        expected = act(bundle.controller_shape, parameters[row], seen[row], STEERING_GAS_BRAKE)
-        np.testing.assert_allclose(real.action[row], expected, atol=2e-6)
-    column = 2 * config.hidden  # reality does not know its reward yet
-    np.testing.assert_allclose(np.delete(dreamt.state, column, 1), np.delete(real.state, column, 1), atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -1,18 +1,17 @@
 """The sources' models: their sizes, and that the export equals the trained model.
-Tests config_fields.py, export.py, vae.py and vae_config.py."""
+Tests config_fields.py, export.py, mdnrnn.py, mdnrnn_config.py, vae.py and vae_config.py."""
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.worker.worldmodel import mdnrnn_config as mdnrnn
 from dreamfleet.worker.worldmodel import vae_config as vae
-from dreamfleet.worker.worldmodel.inference import Decoder, DreamStep, Encoder, PolicyStep
-from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, reward_labels
+from dreamfleet.worker.worldmodel.inference import Decoder, Encoder, PolicyStep
+from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, latent_loss, reward_labels
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae import VAE, Up
 from dreamfleet.worker.worldmodel.vae_config import ConvolutionLayer, VAEConfig
@@ -48,16 +47,14 @@ def learnt(module):
     return sum(each.numel() for each in module.parameters() if each.requires_grad)
 
 
-def test_the_notebooks_lstm_and_heads_have_its_sizes():
-    model = MDNRNN(mdnrnn.NOTEBOOK)
+def test_the_sources_models_have_their_sizes():
+    rnn, eyes = MDNRNN(mdnrnn.NOTEBOOK), VAE(vae.NOTEBOOK)
     assert (mdnrnn.NOTEBOOK.lstm_inputs, mdnrnn.NOTEBOOK.hidden, mdnrnn.NOTEBOOK.outputs) == (36, 256, 481)
-    assert (learnt(model.lstm), learnt(model.heads)) == (300_032, 123_617)
-
-
-def test_the_notebooks_vae_has_its_size_and_the_kernels_of_its_decoder():
-    model = VAE(vae.NOTEBOOK)
+    assert (learnt(rnn.lstm), learnt(rnn.heads)) == (300_032, 123_617)
     assert [each.kernel for each in vae.NOTEBOOK.up] == [5, 5, 6, 6]
-    assert (learnt(model), learnt(model.decoder) + learnt(model.dense)) == (1_062_787, 536_611)
+    assert (learnt(eyes), learnt(eyes.decoder) + learnt(eyes.dense)) == (1_062_787, 536_611)
+    assert learnt(VAE(vae.PAPER)) == 4_348_547  # ctallec/world-models, the same layers
+    assert mdnrnn.PAPER.outputs == 480
 
 
 def test_what_a_transposed_convolution_crops_lies_behind_as_in_the_notebooks():
@@ -69,19 +66,12 @@ def test_what_a_transposed_convolution_crops_lies_behind_as_in_the_notebooks():
 
 
 def test_plain_and_attentive_compare_at_equal_parameters():
-    plain, *others = (
-        learnt(MDNRNN(each))
-        for each in (mdnrnn.REWARDED, *(replace(mdnrnn.ATTENTIVE, hidden=units) for units in (236, 235, 237)))
-    )
-    nearest, *further = (abs(count - plain) for count in others)
-    assert mdnrnn.ATTENTIVE.hidden == 236
-    assert nearest < min(further)
-    assert nearest / plain < 0.004
-
-
-def test_the_papers_vae_and_heads_have_its_sizes():
-    assert learnt(VAE(vae.PAPER)) == 4_348_547  # ctallec/world-models, the same layers
-    assert mdnrnn.PAPER.outputs == 480
+    plain = learnt(MDNRNN(mdnrnn.REWARDED))
+    differences = {
+        hidden: abs(learnt(MDNRNN(replace(mdnrnn.ATTENTIVE, hidden=hidden))) - plain) for hidden in (235, 236, 237)
+    }
+    assert min(differences, key=differences.get) == mdnrnn.ATTENTIVE.hidden == 236
+    assert differences[236] / plain < 0.004
 
 
 @pytest.mark.parametrize("name", VAES)
@@ -136,45 +126,59 @@ def test_the_notebooks_label_is_one_where_nothing_is_gained_and_the_episode_goes
     assert reward_labels("value", rewards, done, 4.0).tolist() == (rewards / 4).tolist()
 
 
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: VAEConfig(picture=32),
-        lambda: VAEConfig(channels=()),
-        lambda: VAEConfig(channels=(1,) * 9),
-        lambda: VAEConfig(kernels=(4, 4, 4)),
-        lambda: VAEConfig(strides=(2, 2, 2, 0)),
-        lambda: VAEConfig(decoder_channels=(8, 8, 8, 3)),
-        lambda: VAEConfig(decoder_kernels=(5, 5, 6, 7)),
-        lambda: VAEConfig(padding="same", decoder_kernels=(1, 1, 1, 1)),
-        lambda: MDNRNNConfig(first_reward=1.0),
-        lambda: VAEConfig(dropout=1.0),
-        lambda: MDNRNNConfig(hidden=0),
-        lambda: MDNRNNConfig(reward="none", previous_reward=True),
-        lambda: MDNRNNConfig(done_weight=3.0),
-        lambda: MDNRNNConfig(done_factor=3.0),
-        lambda: MDNRNNConfig(done=True, done_weight=0.0),
-        lambda: MDNRNNConfig(reward_scale=2.0),
-        lambda: MDNRNNConfig(reward="value", reward_scale=-1.0),
-        lambda: VAEConfig(pixel_weight=-1.0),
-        lambda: VAEConfig(pixel_weight=float("nan")),
-    ],
-)
-def test_sizes_that_make_no_model_are_refused(make):
+NO_VAES = [
+    {"picture": 32},
+    {"channels": ()},
+    {"channels": (1,) * 9},
+    {"kernels": (4, 4, 4)},
+    {"strides": (2, 2, 2, 0)},
+    {"decoder_channels": (8, 8, 8, 3)},
+    {"decoder_kernels": (5, 5, 6, 7)},
+    {"padding": "same", "decoder_kernels": (1, 1, 1, 1)},
+    {"dropout": 1.0},
+    *({"pixel_weight": weight} for weight in (-1.0, float("nan"))),
+]
+NO_MDNRNNS = [
+    {"hidden": 0},
+    {"reward": "none", "previous_reward": True},
+    *({name: 3.0} for name in ("first_reward", "done_weight", "done_factor", "reward_scale")),
+    {"done": True, "done_weight": 0.0},
+    {"reward": "value", "reward_scale": -1.0},
+]
+
+
+@pytest.mark.parametrize("sizes", NO_VAES, ids=str)
+def test_sizes_that_make_no_vae_are_refused(sizes):
     with pytest.raises(UsageError):
-        make()
+        VAEConfig(**sizes)
 
 
-def test_a_model_of_the_paper_is_written_as_it_was_before_every_layer_had_a_flag():
-    later = {"error_factor", "kernels", "strides", "decoder_channels", "decoder_kernels", "pixel_weight"}
-    later |= {"activate_dense"}
-    assert set(to_plain(vae.PAPER)) == set(asdict(vae.PAPER)) - later
-    assert not {"lost", "first_reward", "done_factor", "done_weight", "reward_scale"} & set(to_plain(mdnrnn.REWARDED))
+@pytest.mark.parametrize("sizes", NO_MDNRNNS, ids=str)
+def test_sizes_that_make_no_mdnrnn_are_refused(sizes):
+    with pytest.raises(UsageError):
+        MDNRNNConfig(**sizes)
 
 
-def test_the_first_step_sees_the_label_that_the_notebooks_drives_begin_with(tmp_path):
-    bundle = write_random_bundle(tmp_path / "b.zip", 0, vae.NOTEBOOK, mdnrnn.NOTEBOOK)
-    for step in (PolicyStep(bundle), DreamStep(bundle)):
-        state = step.zero_state(2)
-        assert state[:, 2 * mdnrnn.NOTEBOOK.hidden].tolist() == [1, 1]
-        assert state.sum() == 2
+def test_padding_does_not_count():
+    torch.manual_seed(0)
+    model = MDNRNN(MDNRNNConfig(latent=2, hidden=8))
+    inputs, targets, mask = torch.randn(1, 6, 5), torch.randn(1, 6, 2), torch.ones(1, 6)
+    mask[:, 4:] = 0
+    before = latent_loss(model(inputs), targets, mask)
+    targets[:, 4:] = 1e3
+    assert torch.equal(latent_loss(model(inputs), targets, mask), before)
+
+
+def test_a_joint_mixture_weighs_whole_gaussians():
+    torch.manual_seed(0)
+    model = MDNRNN(MDNRNNConfig(latent=4, hidden=8, mixtures=3, joint=True))
+    inputs, targets = torch.randn(2, 5, 7), torch.randn(2, 5, 4)
+    predicted = model(inputs)
+    assert predicted.log_weights.shape == (2, 5, 1, 3)
+    gaussians = torch.distributions.Independent(
+        torch.distributions.Normal(predicted.means.mT, predicted.log_deviations.mT.exp()), 1
+    )
+    weights = torch.distributions.Categorical(logits=predicted.log_weights[..., 0, :])
+    mixture = torch.distributions.MixtureSameFamily(weights, gaussians)
+    wanted = -mixture.log_prob(targets).mean() / 4
+    assert torch.allclose(latent_loss(predicted, targets, torch.ones(2, 5)), wanted, atol=1e-5)

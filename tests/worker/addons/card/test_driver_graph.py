@@ -1,13 +1,12 @@
 """A controller and its world model as one ONNX graph."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 
-from dreamfleet import find_controller
-from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.errors import UsageError
+from dreamfleet import Controller, UsageError, find_controller
 from dreamfleet.common.runs.lookup import find_bundle_of
 from dreamfleet.worker.addons.card.driver_graph import export_driver, largest_difference
 from dreamfleet.worker.worldmodel.inference import open_graph
@@ -17,19 +16,27 @@ from tests.support.dreams import write_bundle_of
 from tests.support.variants import VARIANTS, controller_of, vectors
 
 
+def difference(controller, bundle):
+    return largest_difference(bundle, controller, export_driver(bundle, controller))
+
+
 @pytest.mark.parametrize("name", ["tiny", "real", "dream", "takecover", "takecover-real"])
 def test_what_ships_acts_by_one_graph_to_the_bit(name):
     controller = find_controller(name)
-    bundle = find_bundle_of(controller, None)
-    assert largest_difference(bundle, controller, export_driver(bundle, controller)) == 0
+    assert difference(controller, find_bundle_of(controller, None)) == 0
 
 
-@pytest.mark.parametrize("features", ["z", "zh"])
-@pytest.mark.parametrize("hidden", [0, 5])
-def test_every_shape_of_controller_acts_to_the_bit(random_bundle, features, hidden):
-    own = random_bundle.with_controllers(random_bundle.shape_of(features, hidden))
-    controller = controller_of(own)
-    assert largest_difference(random_bundle, controller, export_driver(random_bundle, controller)) == 0
+def test_every_shape_of_controller_acts_to_the_bit(random_bundle, tmp_path):
+    for features, hidden in product(("z", "zh"), (0, 5)):
+        own = random_bundle.with_controllers(random_bundle.shape_of(features, hidden))
+        assert difference(controller_of(own), random_bundle) == 0
+    attentive = write_random_bundle(tmp_path / "attentive.zip", rnn=replace(REWARDED, window=3, dropout=0.1))
+    assert difference(controller_of(attentive), attentive) == 0
+    bundle = write_bundle_of("groups", tmp_path / "groups.zip")
+    for options in ("", '{"decide_every": 3, "feedback": "last"}'):
+        own = bundle.with_options(None, options)
+        about = own.controller_shape, vectors(own, 1)[0], bundle.manifest.task, bundle.sha256
+        assert difference(Controller(*about, options=options), bundle) == 0
 
 
 @pytest.mark.parametrize("name", VARIANTS)
@@ -37,24 +44,8 @@ def test_a_variant_acts_as_numpy_computes_it(random_bundle, name):
     """Its choices to the bit; of continuous actions NumPy's last bits differ from ONNX Runtime's."""
     controller = controller_of(random_bundle.with_controllers(None, VARIANTS[name]))
     exact = VARIANTS[name].actions == "discrete"
-    found = largest_difference(random_bundle, controller, export_driver(random_bundle, controller))
+    found = difference(controller, random_bundle)
     assert found == 0 if exact else found < 1e-5
-
-
-def test_a_world_model_with_attention_acts_to_the_bit(tmp_path):
-    bundle = write_random_bundle(tmp_path / "attentive.zip", rnn=replace(REWARDED, window=3, dropout=0.1))
-    controller = controller_of(bundle)
-    assert largest_difference(bundle, controller, export_driver(bundle, controller)) == 0
-
-
-@pytest.mark.parametrize("options", ["", '{"decide_every": 3, "feedback": "last"}'])
-def test_several_choices_at_once_are_made_to_the_bit(tmp_path, options):
-    bundle = write_bundle_of("groups", tmp_path / "groups.zip")
-    own = bundle.with_options(None, options)
-    controller = Controller(
-        own.controller_shape, vectors(own, 1)[0], bundle.manifest.task, bundle.sha256, options=options
-    )
-    assert largest_difference(bundle, controller, export_driver(bundle, controller)) == 0
 
 
 def test_the_graph_has_two_inputs_and_a_batch(random_bundle):

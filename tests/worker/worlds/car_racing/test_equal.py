@@ -1,20 +1,22 @@
 """The native picture is gymnasium's, to the bit. `dreamfleet lab bench env --exact` compares far more.
-Tests environment.py, native_check.py and worker/addons/bench/environment.py."""
+Tests car.py, environment.py, native_check.py and worker/addons/bench/environment.py."""
 
 import copy
-import os
-from pathlib import Path
+from array import array
+from functools import cache
 
 import gymnasium
 import numpy as np
+import psutil
 import pygame
 import pytest
 from gymnasium.error import InvalidAction
+from gymnasium.utils.env_checker import check_env
 
 import dreamfleet.worker.worlds.car_racing  # noqa: F401 - registers the environment
-from dreamfleet.common.artifacts.bundle_store import find_bundle
-from dreamfleet.common.errors import DreamfleetError
+from dreamfleet import DreamfleetError, find_bundle
 from dreamfleet.worker.addons.bench.environment import drive_lap, make_random_policy, random_discrete_action
+from dreamfleet.worker.worlds.car_racing import car
 from dreamfleet.worker.worlds.car_racing.environment import (
     GRASS,
     PICTURES,
@@ -28,26 +30,32 @@ from dreamfleet.worker.worlds.car_racing.native_check import compare, make_car_r
 from dreamfleet.worker.worlds.car_racing.preprocessing import BOX, PREPROCESSINGS
 from dreamfleet.worker.worlds.car_racing.task import make_judging_environment
 
+EXTREMES = [(9, 9, 9), (-9, -9, -9), (1e6, 1, 0), (-1, 1, 1), (0, 0, 0)]
+
 needs_native = pytest.mark.skipif(not is_native_available(), reason="no native module was built")
 
 
-@needs_native
-def test_the_quick_look_at_a_workers_start_finds_it_exact():
-    assert native_is_exact()
+@cache
+def policy():
+    return make_random_policy(find_bundle("tiny"))
 
 
 @pytest.mark.slow
 @needs_native
-@pytest.mark.parametrize("seed", [3, 4])
-def test_random_driving_looks_the_same(seed):
-    assert compare(seed, 160, random_action) is None
-
-
-@pytest.mark.slow
-@needs_native
-def test_evolved_driving_looks_the_same():
-    act = make_random_policy(find_bundle("tiny")).act
-    assert compare(5, 160, lambda _step, seen, _random: act(seen)) is None
+@pytest.mark.parametrize(
+    ("steps", "actions", "settings"),
+    [
+        (160, random_action, {}),
+        (160, lambda _step, seen, _random: policy().act(seen), {}),
+        (260, lambda _step, _seen, _random: np.array([0.0, 1.0, 0.0], np.float32), {}),  # leaves the field
+        (80, lambda step, _seen, _random: np.array(EXTREMES[step // 7 % 5], np.float32), {}),
+        (100, random_action, {"domain_randomize": True}),
+        (100, random_discrete_action, {"continuous": False}),
+        (100, random_action, {"lap_complete_percent": 0.3}),
+    ],
+)
+def test_driving_looks_the_same(steps, actions, settings):
+    assert compare(6, steps, actions, **settings) is None
 
 
 @needs_native
@@ -71,35 +79,6 @@ def test_wider_instructions_change_no_bit(width):
     finally:
         _native.widen(2)
     assert all(map(np.array_equal, *seen))
-
-
-@pytest.mark.slow
-@needs_native
-def test_leaving_the_field_looks_the_same():
-    def straight_out(_step, _picture, _random):
-        return np.array([0.0, 1.0, 0.0], np.float32)
-
-    assert compare(6, 260, straight_out) is None
-
-
-@pytest.mark.slow
-@needs_native
-@pytest.mark.parametrize(
-    ("settings", "actions"),
-    [
-        ({"domain_randomize": True}, random_action),
-        ({"continuous": False}, random_discrete_action),
-        ({"lap_complete_percent": 0.3}, random_action),
-    ],
-)
-def test_every_option_looks_the_same(settings, actions):
-    assert compare(7, 100, actions, **settings) is None
-
-
-@needs_native
-def test_extreme_actions_behave_as_gymnasiums():
-    extremes = [(9, 9, 9), (-9, -9, -9), (1e6, 1, 0), (-1, 1, 1), (0, 0, 0)]
-    assert compare(8, 80, lambda step, _seen, _random: np.array(extremes[step // 7 % 5], np.float32)) is None
 
 
 @needs_native
@@ -127,15 +106,10 @@ def test_one_more_environment_adds_little_memory():
         drive_all([environment], [1], 20)
         return environment
 
-    kept = [drawing() for _ in range(8)]
-    before = memory()
+    kept, process = [drawing() for _ in range(8)], psutil.Process()
+    before = process.memory_info().rss
     kept.append(drawing())
-    assert memory() - before < 6 * 2**20
-
-
-def memory():
-    """The resident memory of this process, in bytes."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    assert process.memory_info().rss - before < 6 * 2**20
 
 
 @needs_native
@@ -181,12 +155,6 @@ def test_a_user_may_let_gymnasium_draw(monkeypatch, said, by):
     assert getattr(make_judging_environment(BOX, "rgb_array").unwrapped, "drawn_by", "-") == "-"
 
 
-def test_a_copy_draws_as_its_original():
-    copied = copy.deepcopy(CarRacing(preprocessing="box-64", native=False, checked=7, domain_randomize=True))
-    assert (copied._checked, copied.drawn_by, copied.domain_randomize) == (7, "gymnasium", True)
-    assert copied.observation_space.shape == BOX.shape
-
-
 @needs_native
 def test_where_gymnasium_draws_it_drives_too(monkeypatch):
     monkeypatch.setattr("dreamfleet.worker.worlds.car_racing.car.STIFFNESS", 100_000)  # as if we computed otherwise
@@ -199,11 +167,14 @@ def test_where_gymnasium_draws_it_drives_too(monkeypatch):
     assert positions[0] == positions[1] != positions[2]
 
 
-def test_where_it_was_not_built_gymnasium_draws():
+def test_where_it_was_not_built_gymnasium_draws_and_a_copy_draws_as_its_original():
     ours, small = CarRacing(native=False), CarRacing(native=False, preprocessing="box-64")
     observation, small_one = ours.reset(seed=1)[0], small.reset(seed=1)[0]
     assert ours.drawn_by == "gymnasium"
     assert np.array_equal(BOX.picture(observation), small_one)
+    copied = copy.deepcopy(CarRacing(preprocessing="box-64", native=False, checked=7, domain_randomize=True))
+    assert (copied._checked, copied.drawn_by, copied.domain_randomize) == (7, "gymnasium", True)
+    assert copied.observation_space.shape == BOX.shape
 
 
 @pytest.mark.parametrize("action", [np.array([np.nan, 0, 0]), np.array([0, np.inf, 0]), np.zeros(2), np.zeros((1, 3))])
@@ -217,16 +188,11 @@ def test_an_action_that_is_none_is_refused_and_the_environment_goes_on(action):
 
 @pytest.mark.filterwarnings("ignore")
 def test_gymnasium_finds_it_a_well_made_environment():
-    from gymnasium.utils.env_checker import check_env
-
     environment = gymnasium.make("dreamfleet/CarRacing-v3", render_mode="rgb_array")
+    assert environment.spec.max_episode_steps == 1000
     check_env(environment.unwrapped, skip_render_check=False)
     environment.reset(seed=1)
     assert environment.render().shape == (400, 600, 3)
-
-
-def test_an_episode_ends_after_a_thousand_steps():
-    assert make_car_racing(preprocessing="box-64").spec.max_episode_steps == 1000
 
 
 def test_a_score_is_written_after_somebody_closed_pygame():
@@ -236,5 +202,23 @@ def test_a_score_is_written_after_somebody_closed_pygame():
     assert np.array_equal(render_score("0012"), before)
 
 
-def test_score_texts_are_kept():
-    assert render_score("0123") is render_score("0123")
+@needs_native
+def test_a_box2d_that_keeps_its_bodies_elsewhere_is_not_read(monkeypatch, caplog):
+    monkeypatch.setattr(car._native, "knows", lambda _contact: False)
+    assert car.find_native.__wrapped__() is None
+    assert [each.levelname for each in caplog.records] == ["WARNING"]
+
+
+@needs_native
+def test_what_is_read_is_what_box2d_says():
+    environment = CarRacing(preprocessing="box-64")
+    environment.reset(seed=1)
+    for _ in range(30):
+        environment.step(np.array([0.3, 1.0, 0.0]))
+    seen = array("d", bytes(8 * 20))
+    car.find_native().look(seen, environment.car)
+    bodies = (*environment.car.wheels, environment.car.hull)
+    told = [(*body.position, body.angle, getattr(body, "phase", 0.0)) for body in bodies]
+    assert np.array_equal(np.reshape(seen, (5, 4)), told)
+    with pytest.raises(AttributeError, match="this"):
+        car.find_native().touch(object(), object(), True)

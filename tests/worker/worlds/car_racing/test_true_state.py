@@ -12,14 +12,6 @@ from dreamfleet.worker.tasks.true_state import TaskWithTrueState
 from dreamfleet.worker.worlds.car_racing.native_check import make_car_racing
 from dreamfleet.worker.worlds.car_racing.true_state import LOOK_AHEAD, CentreLine, read_true_state, wrap_angle
 
-BENDS = [f"curvature_{distance}m" for distance in LOOK_AHEAD]
-
-
-def circle(radius, count=200):
-    """A track driven counter-clockwise; at an angle of 0 it heads along y, which is a heading of 0."""
-    angles = 2 * np.pi * np.arange(count) / count
-    return CentreLine.of(np.stack([angles, angles, radius * np.cos(angles), radius * np.sin(angles)], axis=1))
-
 
 def stadium(straight=200.0, radius=50.0, step=2.0):
     """Two straights along y, the first from the origin upwards, and two half circles to the left."""
@@ -31,15 +23,13 @@ def stadium(straight=200.0, radius=50.0, step=2.0):
     return CentreLine.of(rows)
 
 
-def test_a_straight_road_bends_nowhere_and_a_turn_by_its_radius():
+def test_a_straight_road_bends_nowhere_and_a_turn_by_its_radius_also_over_the_seam():
     line = stadium()
     np.testing.assert_allclose(line.curvature([20, 100, 180]), 0, atol=1e-12)
     np.testing.assert_allclose(line.curvature([230, 280, 330]), 1 / 50, rtol=1e-3)
-
-
-def test_a_circle_bends_alike_everywhere_also_over_its_seam():
-    line = circle(50)
-    np.testing.assert_allclose(line.curvature(np.linspace(0, 1000, 77)), 1 / 50, rtol=1e-3)
+    angles = 2 * np.pi * np.arange(200) / 200
+    circle = CentreLine.of(np.stack([angles, angles, 50 * np.cos(angles), 50 * np.sin(angles)], axis=1))
+    np.testing.assert_allclose(circle.curvature(np.linspace(0, 1000, 77)), 1 / 50, rtol=1e-3)
 
 
 def test_left_of_a_road_is_positive():
@@ -75,17 +65,13 @@ def put(environment, tile, aside=0.0, turn=0.0):
     return read_true_state(inner)
 
 
-@pytest.mark.parametrize("tile", [0, 1, 40, 100, -1])
-def test_a_car_on_a_tile_is_on_the_centre_line(environment, tile):
+@pytest.mark.parametrize("tile", [0, 1, 100, -1])
+def test_a_car_on_a_tile_is_on_the_centre_line_or_beside_it_and_turned_to_a_side(environment, tile):
     truth = put(environment, tile)
-    assert truth["lateral_offset"] == pytest.approx(0, abs=1e-5)
-    assert truth["heading_error"] == pytest.approx(0, abs=1e-5)
+    assert (truth["lateral_offset"], truth["heading_error"]) == pytest.approx((0, 0), abs=1e-5)
     assert truth["speed"] == truth["yaw_rate"] == truth["side_slip"] == 0
-
-
-def test_a_car_beside_and_turned_to_the_left_says_so_and_to_the_right_too(environment):
-    for sign in (1, -1):
-        truth = put(environment, 50, aside=4 * sign, turn=0.3 * sign)
+    for sign in (1, -1):  # left and right
+        truth = put(environment, tile, aside=4 * sign, turn=0.3 * sign)
         assert truth["lateral_offset"] == pytest.approx(4 * sign, rel=0.1)
         assert truth["heading_error"] == pytest.approx(0.3 * sign, abs=0.15)
 
@@ -120,11 +106,10 @@ def test_steering_turns_wheels_car_and_offset_to_one_side(environment, side):
 def test_side_slip_is_speed_to_the_left(environment):
     put(environment, 30)
     hull = environment.unwrapped.car.hull
-    hull.linearVelocity = (10 * -math.sin(hull.angle) - 3 * math.cos(hull.angle),
-                           10 * math.cos(hull.angle) - 3 * math.sin(hull.angle))  # fmt: skip
+    sine, cosine = math.sin(hull.angle), math.cos(hull.angle)
+    hull.linearVelocity = -10 * sine - 3 * cosine, 10 * cosine - 3 * sine
     truth = read_true_state(environment.unwrapped)
-    assert truth["side_slip"] == pytest.approx(3, rel=1e-5)
-    assert truth["speed"] == pytest.approx(math.hypot(10, 3), rel=1e-5)
+    assert (truth["side_slip"], truth["speed"]) == pytest.approx((3, math.hypot(10, 3)), rel=1e-5)
 
 
 def test_full_gas_straight_on_leaves_the_road_for_good(environment):
@@ -142,5 +127,5 @@ def test_every_step_has_the_same_names_in_both_environments(environment):
     judge = make_car_racing(preprocessing="raw-96")
     judge.reset(seed=20_003)
     assert task.truth(judge) == task.truth(environment)
-    assert set(BENDS) < set(task.truth(judge))
+    assert {f"curvature_{distance}m" for distance in LOOK_AHEAD} < set(task.truth(judge))
     judge.close()

@@ -5,20 +5,19 @@ import json
 import numpy as np
 import pytest
 
-from dreamfleet.common.artifacts.controller import Controller, ControllerShape
+from dreamfleet import Controller, ControllerShape, Scorer, TaskSpec
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
-from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.addons.evaluation.agents import make_agent
 from dreamfleet.worker.addons.evaluation.evaluation import evaluate
 from dreamfleet.worker.addons.recording.recording import record
 from dreamfleet.worker.addons.task_check import dry_run
 from dreamfleet.worker.scoring.rollout import DataWorld
-from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.training.data.collect import drive_episode
 from dreamfleet.worker.training.data.collect_config import CollectConfig
 from dreamfleet.worker.worlds.gym.task import GymTask
 from tests.support.bundles import write_world_bundle
 from tests.support.single_environments import MODULE
+from tests.support.watching import Watching
 
 KINDS = pytest.mark.parametrize("kind", ["Single", "Shared"])
 SHAPE = ControllerShape(2, 1)
@@ -26,16 +25,6 @@ SHAPE = ControllerShape(2, 1)
 
 def name_of(kind):
     return f"gym:{MODULE}:{kind}-v0"
-
-
-class Watching(list):
-    """An observer of every step."""
-
-    def is_due(self):
-        return True
-
-    def observe(self, episode, look):
-        self.append(look().step)
 
 
 @KINDS
@@ -61,12 +50,10 @@ def test_the_check_before_a_run_finds_nothing(kind):
 
 @KINDS
 def test_a_controller_is_evaluated_and_recorded(kind, tmp_path):
-    controller = Controller(SHAPE, np.zeros(3, np.float32), name_of(kind), "")
-    agent = make_agent(controller)
+    agent = make_agent(Controller(SHAPE, np.zeros(3, np.float32), name_of(kind), ""))
     (episode,) = evaluate(agent, (7,), jobs=1)
     assert episode.steps == 20
-    score = record(agent, 7, 20, tmp_path / "drive.mp4")
-    assert score == episode.score
+    assert record(agent, 7, 20, tmp_path / "drive.mp4") == episode.score
 
 
 @KINDS

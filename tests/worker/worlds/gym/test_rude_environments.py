@@ -3,16 +3,14 @@
 import json
 import signal
 import subprocess
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from dreamfleet.common.host.processes import command
-from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.worlds.gym.task import GymTask
 from tests.support import pixel_fakes
-from tests.support.processes import DEADLINE, environment, until
+from tests.support.processes import DEADLINE, environment, runs, until
 
 RUDE = f"{pixel_fakes.MODULE}:Rude-v0"
 
@@ -34,15 +32,6 @@ def test_what_it_does_as_it_is_made_and_closed_is_undone(close, capfd, caplog):
     assert "\n" not in caplog.messages[-1]
 
 
-def test_an_interrupt_of_its_close_passes():
-    class Interrupted(pixel_fakes.Grey):
-        def close(self):
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        close_environment(Interrupted())
-
-
 def test_drives_are_collected_where_the_verb_was_told_and_its_answer_is_whole(tmp_path):
     born = tmp_path / "born"
     words = ("collect", "--data", "data", "--task", f"gym:{RUDE}", "--environment", f"child={born}")
@@ -53,13 +42,6 @@ def test_drives_are_collected_where_the_verb_was_told_and_its_answer_is_whole(tm
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["new_episodes"] == 2
     assert sorted(each.name for each in (tmp_path / "data" / "episodes").iterdir()) == ["000000.npz", "000001.npz"]
-    assert born.read_text().split()
-    until(lambda: not list(running_with(born)), "a process of the environment outlives the verb")
-
-
-def running_with(argument):
-    """The processes that have this argument."""
-    for each in Path("/proc").glob("[0-9]*/cmdline"):
-        with suppress(OSError):
-            if str(argument).encode() in each.read_bytes().split(b"\0"):
-                yield each
+    children = [int(each) for each in born.read_text().split()]
+    assert children
+    until(lambda: not any(map(runs, children)), "a process of the environment outlives the verb")

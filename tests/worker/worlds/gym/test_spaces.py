@@ -7,38 +7,12 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from dreamfleet.common.artifacts.actions import Continuous
-from dreamfleet.common.artifacts.controller import ControllerShape
-from dreamfleet.common.errors import UsageError
-from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.common.protocol.tasks import describe_task
-from dreamfleet.worker.scoring.scorer import Scorer
+from dreamfleet import Continuous, Scorer, UsageError
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worlds.gym.spaces import make_converter, vector_actions
+from tests.support.specs import described_spec
 from tests.support.strict_environments import ACTIONS, STRICT
-
-
-def test_a_space_has_a_group_of_outputs_for_each_number():
-    for space in (
-        spaces.MultiDiscrete([2, 3], start=[5, 0]),
-        spaces.Dict({"b": spaces.Discrete(3, start=2), "a": spaces.Tuple((spaces.MultiBinary(2), spaces.Discrete(2)))}),
-    ):
-        actions = vector_actions(space, "it")
-        convert = make_converter(space, actions)
-        rows = actions.from_numbers(list(product(*map(range, actions.sizes))))
-        elements = [convert(row) for row in rows]
-        assert all(each in space for each in elements)
-        flat = [tuple(spaces.flatten(space, each)) for each in elements]
-        assert flat == [tuple(row) for row in rows]
-        assert len(set(flat)) == len(flat) == prod(actions.sizes)
-        assert actions.outputs == sum(actions.sizes)
-
-
-def test_an_action_near_a_choice_is_that_choice():
-    space = spaces.MultiDiscrete([2, 3])
-    convert = make_converter(space, vector_actions(space, "it"))
-    assert convert(np.float32([0.2, 0.7, 0.1, 0.1, 0.3])).tolist() == [1, 2]
 
 
 def test_bounded_numbers_anywhere_are_one_vector():
@@ -69,39 +43,22 @@ def test_other_actions_are_refused(space):
         vector_actions(space, "it")
 
 
-def spec(kind):
-    about = describe_task(f"gym:{STRICT}", {"environment": {"actions": kind}})
-    return TaskSpec(
-        f"gym:{STRICT}", "", 1000, 0, ControllerShape(about.observations, about.outputs), options=about.options
-    )
+def scorer(kind):
+    return Scorer(described_spec(f"gym:{STRICT}", environment={"actions": kind}))
 
 
-TAKEN = [each for each in ACTIONS if each != "endless"]
-
-
-@pytest.mark.parametrize("kind", TAKEN)
-def test_a_saturated_controller_stays_within_the_space(kind):
-    scorer = Scorer(spec(kind))
+@pytest.mark.parametrize("kind", sorted({*ACTIONS} - {"endless"}))
+def test_saturated_controllers_and_world_models_stay_within_the_space(kind):
+    actions, made = vector_actions(ACTIONS[kind], "it"), scorer(kind)
+    convert = make_converter(ACTIONS[kind], actions)
     for value in (-1e6, 0, 1e6):
-        parameters = np.full(scorer.spec.controller.size, value, np.float32)
-        assert scorer.score("score", parameters, 1).fitness == 20
-    scorer.close()
-
-
-@pytest.mark.parametrize("kind", TAKEN)
-def test_a_world_models_actions_stay_within_the_space(kind):
-    space = ACTIONS[kind]
-    actions = vector_actions(space, "it")
-    convert = make_converter(space, actions)
-    for value in (-1e6, 0, 1e6):
-        assert convert(actions.to_action(np.full(actions.outputs, value, np.float32))) in space
+        assert convert(actions.to_action(np.full(actions.outputs, value, np.float32))) in ACTIONS[kind]
+        assert made.score("score", np.full(made.spec.controller.size, value, np.float32), 1).fitness == 20
 
 
 def test_an_environment_of_single_precision_gets_the_vector_as_it_is():
-    assignment = Assignment(spec("float32"))
-    task = find_task(assignment.spec.task)
     action = np.float32([0.05, -0.1])
-    with task.make_environment(assignment) as environment:
+    with find_task(f"gym:{STRICT}").make_environment(Assignment(scorer("float32").spec)) as environment:
         environment.reset(seed=1)
         assert environment.step(action)[4]["taken"] is action
 
@@ -113,9 +70,26 @@ def test_whole_numbers_are_the_nearest():
 
 
 @pytest.mark.parametrize(
+    "space",
+    [
+        spaces.MultiDiscrete([2, 3], start=[5, 0]),
+        spaces.Dict({"b": spaces.Discrete(3, start=2), "a": spaces.Tuple((spaces.MultiBinary(2), spaces.Discrete(2)))}),
+    ],
+)
+def test_each_row_of_choices_is_another_element_of_the_space_and_a_row_near_it_is_the_same(space):
+    actions = vector_actions(space, "it")
+    convert = make_converter(space, actions)
+    rows = actions.from_numbers(list(product(*map(range, actions.sizes))))
+    flat = [tuple(spaces.flatten(space, convert(row))) for row in rows]
+    assert all(convert(row) in space for row in rows)
+    assert flat == [tuple(row) for row in rows]
+    assert flat == [tuple(spaces.flatten(space, convert(0.6 * row + 0.2))) for row in rows]
+    assert len(set(flat)) == len(flat) == prod(actions.sizes)
+
+
+@pytest.mark.parametrize(
     ("space", "outputs"),
     [
-        (spaces.MultiDiscrete([11, 11, 11]), 33),
         (spaces.MultiDiscrete([[3, 2], [4, 5]], start=[[1, 0], [0, 9]]), 14),
         (spaces.MultiBinary(12), 24),
         (spaces.MultiBinary((2, 3)), 12),

@@ -11,9 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dreamfleet.common.artifacts.controller import ControllerShape
-from dreamfleet.common.errors import UsageError
-from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet import ControllerShape, TaskSpec, UsageError
 from dreamfleet.worker.service.child import ChildReady, ScorerArguments
 from dreamfleet.worker.service.child_process import ChildProcess
 from dreamfleet.worker.worlds.takecover import process
@@ -31,7 +29,7 @@ game.reset(seed=1)
 print("plays", flush=True)
 sys.stdin.readline()
 """
-KILLED = "os.kill(os.getpid(), signal.{})"
+KILL = "os.kill(os.getpid(), signal.{})"
 
 
 def start_program(ending, **more):
@@ -52,24 +50,26 @@ def only_game(parent):
     return os.pidfd_open(game), name_of_game(game)
 
 
-def test_nothing_is_left_while_a_game_plays_nor_afterwards(doom, temporary, tmp_path, monkeypatch):
-    current = tmp_path / "current"
-    current.mkdir()
-    monkeypatch.chdir(current)
+@pytest.fixture
+def game(doom, tmp_path, monkeypatch):
+    (tmp_path / "current").mkdir()
+    monkeypatch.chdir(tmp_path / "current")
     game = TakeCover(4)
     game.reset(seed=1)
+    yield game
+    game.close()
+
+
+def test_nothing_is_left_while_a_game_plays_nor_afterwards(temporary, game):
     running, name = only_game(os.getpid())
-    assert (list(current.iterdir()), folders(temporary), shared_files(name)) == ([], [], [])
+    assert (list(Path().iterdir()), folders(temporary), shared_files(name)) == ([], [], [])
     game.step(0)
     game.close()
     assert has_ended(running)
-    assert (list(current.iterdir()), folders(temporary), shared_files(name)) == ([], [], [])
+    assert (list(Path().iterdir()), folders(temporary), shared_files(name)) == ([], [], [])
 
 
-@pytest.mark.parametrize(
-    "ending",
-    ["os.kill(os.getpid(), signal.SIGKILL)", "os._exit(3)", "sys.exit()", "os.kill(os.getpid(), signal.SIGTERM)"],
-)
+@pytest.mark.parametrize("ending", [KILL.format("SIGKILL"), KILL.format("SIGTERM"), "os._exit(3)", "sys.exit()"])
 def test_a_game_ends_with_its_process_however_that_ends(doom, temporary, tmp_path, ending):
     with start_program(ending, cwd=tmp_path) as program:
         assert program.stdout.readline() == "plays\n"
@@ -91,15 +91,11 @@ def test_a_game_ends_with_its_slot(doom, temporary):
     assert (folders(temporary), shared_files(name)) == ([], [])
 
 
-def test_signals_to_all_processes_of_a_service_do_not_end_a_game(doom):
-    game = TakeCover(4)
-    game.reset(seed=1)
+def test_signals_to_all_processes_of_a_service_do_not_end_a_game(game):
     (running,) = games(os.getpid())
     for number in (signal.SIGINT, signal.SIGTERM):
         os.kill(running, number)
-    before = game.step(0)[1]
-    assert (before, games(os.getpid())) == (4.0, {running})
-    game.close()
+    assert (game.step(0)[1], games(os.getpid())) == (4.0, {running})
 
 
 @pytest.mark.needs_doom
@@ -112,16 +108,12 @@ def test_a_game_outlives_the_thread_that_started_it():
     game.close()
 
 
-def obey_permissions():
-    """Take from a superuser's programs the right to write where nobody may."""
-    ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, CAP_DAC_OVERRIDE)
-
-
 def test_a_current_folder_that_cannot_be_written_is_no_crash(doom, temporary, tmp_path):
     current = tmp_path / "current"
     current.mkdir(mode=0o555)
     ending = 'print(os.access(".", os.W_OK), game.step(0)[1])'
-    with start_program(ending, cwd=current, preexec_fn=obey_permissions) as program:
+    drop = lambda: ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, CAP_DAC_OVERRIDE)  # noqa: E731 - a superuser's right
+    with start_program(ending, cwd=current, preexec_fn=drop) as program:
         out, _ = program.communicate("\n", timeout=DEADLINE)
     assert (program.returncode, out) == (0, "plays\nFalse 4.0\n")
 
@@ -142,8 +134,7 @@ def test_a_game_that_does_not_start_is_an_error_and_leaves_nothing(fake_doom, te
     assert (folders(temporary), games(os.getpid())) == ([], set())
 
 
-def test_a_crashed_game_is_an_error_and_the_next_episode_starts_another(doom):
-    game = TakeCover(4)
+def test_a_crashed_game_is_an_error_and_the_next_episode_starts_another(game):
     first, _ = game.reset(seed=1)
     running, _ = only_game(os.getpid())
     signal.pidfd_send_signal(running, signal.SIGKILL)
@@ -151,7 +142,6 @@ def test_a_crashed_game_is_an_error_and_the_next_episode_starts_another(doom):
     with pytest.raises(Exception, match=r"crash|not running"):
         game.step(0)
     assert (game.reset(seed=1)[0] == first).all()
-    game.close()
 
 
 def test_what_a_killed_start_left_is_removed_by_the_next(temporary, tmp_path, monkeypatch):

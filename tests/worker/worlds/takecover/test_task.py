@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet import Scorer, TaskSpec
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
 from dreamfleet.common.cli.command_line import main
-from dreamfleet.common.errors import BundleError, UsageError
-from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.tasks import describe_task
 from dreamfleet.common.runs.seeds import fold_seed
-from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.recordable import RecordableTask, TaskWithOptions, TaskWithPolicies
 from dreamfleet.worker.tasks.registry import find_task, find_world
@@ -24,15 +22,11 @@ from dreamfleet.worker.worlds.takecover.options import TakeCoverOptions
 from dreamfleet.worker.worlds.takecover.task import TakeCoverTask, cut_in_thirds, pick_choice
 from tests.support.bundles import write_world_bundle
 from tests.support.doom import games
-from tests.support.world_contract import check_driver, check_world
+from tests.support.specs import described_spec
+from tests.support.variants import vectors
+from tests.support.world_contract import check_world
 
 ALL_CHANGED = '{"environment": {"actions": "thirds", "crop": "30:90,0:160", "tics": 1}}'
-
-
-def spec(**arguments):
-    description = describe_task("takecover", {"environment": arguments})
-    shape = ControllerShape(description.observations, description.outputs)
-    return TaskSpec("takecover", "", 525, 0, shape, options=description.options)
 
 
 def pictures_of(tics, actions, seed=3):
@@ -50,36 +44,38 @@ def pictures_of(tics, actions, seed=3):
 
 
 @pytest.mark.parametrize("options", ["", ALL_CHANGED])
-def test_the_task_keeps_the_contract_of_recordable_worlds(doom, options):
+def test_the_task_keeps_the_contract_of_recordable_worlds_and_its_drivers_follow_the_actions(doom, options):
     task = find_task("takecover").with_options(options)
     check_world(task)
     assert all(isinstance(task, each) for each in (RecordableTask, TaskWithOptions, TaskWithPolicies))
+    policy = task.policies["uniform"](np.random.default_rng(1))
+    drawn = {tuple(policy.act(None).tolist()) for _ in range(20)}
+    assert len(drawn) == (20 if options else 3)
 
 
 def test_a_world_follows_from_its_options():
     task = find_task("takecover")
-    assert (task.world.horizon, task.world.frames_per_second, task.world.dream_reward.gain) == (525, 9, 4.0)
-    assert (task.world.actions.outputs, *task.preprocessings) == (3, "box-64", "box-96")
     other = task.with_options(ALL_CHANGED)
+    assert (task.world.horizon, task.world.frames_per_second, task.world.dream_reward.gain) == (525, 9, 4.0)
+    assert (task.world.actions.outputs, [*task.preprocessings]) == (3, ["box-64", "box-96"])
     assert (other.world.horizon, other.world.frames_per_second, other.world.dream_reward.gain) == (2100, 35, 1.0)
-    assert (other.world.actions.outputs, *other.preprocessings) == (
-        1, "box-64 of 30:90,0:160", "box-96 of 30:90,0:160",
-    )  # fmt: skip
+    names = [f"{name} of 30:90,0:160" for name in ("box-64", "box-96")]
+    assert (other.world.actions.outputs, [*other.preprocessings]) == (1, names)
     assert TakeCoverOptions(tics=8).horizon == 263  # of which the last is held for 4 tics
+    stay, left, right = np.eye(3, dtype=np.float32)
+    mirrored = [task.world.mirror.apply(each).tolist() for each in (stay, left, right)]
+    assert mirrored == [each.tolist() for each in (stay, right, left)]
+    assert other.world.mirror.apply(np.float32([0.5])) == -0.5
 
 
-def test_options_are_frozen_where_they_differ_from_the_defaults():
+def test_options_are_frozen_where_they_differ_from_the_defaults_also_by_flags_that_any_world_takes():
     task = TakeCoverTask()
     assert task.parse_options({}) == task.parse_options({"environment": {"tics": 4, "actions": "choices"}}) == ""
     assert task.parse_options({"environment": {"tics": 1}}) == '{"environment": {"tics": 1}}'
     changed = TakeCoverOptions.parse(ALL_CHANGED)
-    assert changed.text == ALL_CHANGED
-    assert changed.part == (30, 90, 0, 160)
-
-
-def test_flags_that_any_world_takes_are_options_too():
-    arguments = {"environment": {"actions": "thirds"}, "skip": 1, "crop": "30:90,0:160"}
-    assert TakeCoverTask().parse_options(arguments) == ALL_CHANGED
+    assert (changed.text, changed.part) == (ALL_CHANGED, (30, 90, 0, 160))
+    flags = {"environment": {"actions": "thirds"}, "skip": 1, "crop": "30:90,0:160"}
+    assert task.parse_options(flags) == ALL_CHANGED
 
 
 @pytest.mark.parametrize(
@@ -108,13 +104,6 @@ def test_an_action_is_one_of_three():
     assert [pick_choice(row) for row in np.eye(3, dtype=np.float32)] == [STAY, LEFT, RIGHT]
     numbers = np.array([[-1], [-0.34], [-0.33], [0], [0.33], [0.34], [1]], np.float32)
     assert [cut_in_thirds(number) for number in numbers] == [LEFT, LEFT, STAY, STAY, STAY, RIGHT, RIGHT]
-
-
-def test_drivers_follow_the_actions():
-    task = find_task("takecover").with_options(ALL_CHANGED)
-    check_driver(task, "held")
-    policy = task.policies["uniform"](np.random.default_rng(1))
-    assert len({float(policy.act(None)[0]) for _ in range(20)}) == 20
 
 
 def test_the_environment_is_one_of_gymnasiums(doom):
@@ -147,40 +136,32 @@ def test_the_limit_of_tics_is_no_death(fake_doom):
 
 
 def test_a_long_seed_is_folded_and_a_reset_without_one_goes_on(doom):
-    game, long = TakeCover(), 2**53 - 1
-    after = {}
-    for seed in (long, fold_seed(long), long - 1):
+    def play(seed):
         game.reset(seed=seed)
-        after[seed] = [game.step(RIGHT)[0].tobytes() for _ in range(120)]
-    assert after[long] == after[fold_seed(long)] != after[long - 1]
-    games_without = []
-    for _ in range(2):
-        game.reset(seed=1)
-        for _ in range(2):
-            game.reset()
-            games_without.append(b"".join(game.step(RIGHT)[0].tobytes() for _ in range(120)))
-    assert games_without[:2] == games_without[2:]
-    assert games_without[0] != games_without[1]
+        return b"".join(game.step(RIGHT)[0].tobytes() for _ in range(120))
+
+    game, long = TakeCover(), 2**53 - 1
+    assert play(long) == play(fold_seed(long)) != play(long - 1)
+    first, again = ([play(seed) for seed in (1, None, None)][1:] for _ in range(2))
+    assert first == again
+    assert first[0] != first[1]
     game.close()
 
 
-def test_a_run_without_a_world_model_sees_a_band_of_pixels(doom):
-    description = describe_task("takecover", {"environment": {"tics": 1}})
-    assert (description.observations, description.outputs, description.packages) == (
-        128, 3, ("numpy", "onnxruntime", "vizdoom"),
-    )  # fmt: skip
-    assert json.loads(description.options) == {"environment": {"tics": 1}}
-    scorer = Scorer(spec(tics=2))
+def test_a_run_without_a_world_model_sees_a_band_of_pixels_and_whoever_watches_the_games_picture(doom):
+    about = describe_task("takecover", {"environment": {"tics": 1}})
+    packages = "numpy", "onnxruntime", "vizdoom"
+    assert (about.observations, about.outputs, about.packages) == (128, 3, packages)
+    assert json.loads(about.options) == {"environment": {"tics": 1}}
+    scorer = Scorer(described_spec("takecover", 525, environment={"tics": 2}))
     parameters = np.random.default_rng(1).normal(size=387).astype(np.float32)
     score = scorer.score("score", parameters, 2**40)
     assert score == scorer.score("score", parameters, 2**40)
     assert 0 < score.fitness <= 2 * score.steps < score.fitness + 2
     assert scorer.drawn_by == "vizdoom"
     scorer.close()
-
-
-def test_whoever_watches_gets_the_games_picture(fake_doom):
-    environment = TakeCoverTask().make_watched_environment(Assignment(spec()))
+    environment = TakeCoverTask().make_watched_environment(Assignment(described_spec("takecover")))
+    assert games(os.getpid()) == set(), "what nobody resets starts no game"
     observation, _ = environment.reset(seed=1)
     assert (observation.shape, environment.render().shape) == ((128,), (120, 160, 3))
     environment.close()
@@ -188,44 +169,23 @@ def test_whoever_watches_gets_the_games_picture(fake_doom):
 
 @pytest.mark.parametrize("options", ["", ALL_CHANGED])
 def test_a_world_model_brings_its_options(doom, tmp_path, options):
-    world = find_world("takecover", options)
-    facts = world.world.facts(RewardFacts("survival", world.world.dream_reward.gain), EndRule("drawn"), options)
-    bundle = write_world_bundle(
-        tmp_path / "takecover.zip", facts, "takecover", preprocessing=next(iter(world.preprocessings))
-    )
-    assert (facts.score_word, facts.marks, facts.horizon) == ("game", (750.0,), world.world.horizon)
-    scorer = Scorer(TaskSpec("takecover", bundle.sha256, horizon=5, patience=0), bundle)
-    parameters = np.random.default_rng(1).normal(size=bundle.controller_shape.size).astype(np.float32)
+    task = find_world("takecover", options)
+    facts = task.world.facts(RewardFacts("survival", task.world.dream_reward.gain), EndRule("drawn"), options)
+    (preprocessing, *_), path = task.preprocessings, tmp_path / "takecover.zip"
+    bundle = write_world_bundle(path, facts, "takecover", preprocessing=preprocessing)
+    assert (facts.score_word, facts.marks, facts.horizon) == ("game", (750.0,), task.world.horizon)
+    scorer, (parameters,) = Scorer(TaskSpec("takecover", bundle.sha256, 5, 0), bundle), vectors(bundle, 1, scale=1.0)
     score = scorer.score("score", parameters, 2**40)
     assert (score.steps, score.fitness) == (5, 5 * facts.reward.gain)
     assert score == scorer.score("score", parameters, 2**40)
     scorer.close()
 
 
-def test_a_mirrored_picture_shows_the_other_way():
-    choices, thirds = (find_world("takecover", options).world.mirror for options in ("", ALL_CHANGED))
-    stay, left, right = np.eye(3, dtype=np.float32)
-    assert [(choices.apply(each) == other).all() for each, other in ((stay, stay), (left, right), (right, left))]
-    assert thirds.apply(np.float32([0.5])) == -0.5
-
-
-def test_a_bundle_of_another_world_is_refused(fake_doom, random_bundle):
-    assignment = Assignment.of("takecover", random_bundle)
-    with pytest.raises(BundleError, match=r"'car-racing'.*takecover .*'box-64'"):
-        TakeCoverTask().make_environment(assignment)
-
-
 def test_without_the_package_the_task_is_known_and_an_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "vizdoom", None)
     assert find_task("takecover").world.threshold == 750
     with pytest.raises(UsageError, match=r"'dreamfleet\[doom\]'"):
-        Scorer(spec())
-
-
-def test_an_environment_that_nobody_resets_starts_no_game(doom):
-    environment = TakeCoverTask().make_recorded("box-64")
-    assert games(os.getpid()) == set()
-    environment.close()
+        Scorer(described_spec("takecover"))
 
 
 @pytest.mark.add_on
