@@ -34,6 +34,7 @@ START_TIMEOUT = 60.0  # seconds until a started worker must have begun
 DRAIN_TIMEOUT = 900.0  # seconds that a draining worker may take
 STOP_AT_ONCE = ((signal.SIGTERM, 1.0), (signal.SIGTERM, 10.0), (signal.SIGKILL, 30.0))  # each with its timeout
 STOP_DRAINED = ((signal.SIGTERM, DRAIN_TIMEOUT),)
+MOST_ATTEMPTS = 20  # to create a folder that other commands remove
 LEAST_FREE = 700_000_000  # bytes needed while an environment is made
 ROOM, LEAST_ROOM = "room", 1 << 16  # a file, and its bytes, that must fit before a worker is replaced
 LONGEST_TAIL = 8192  # bytes read from the end of a log for its last line
@@ -114,7 +115,9 @@ class HostFolder:
         """
         if self._listed() is not None or any(WorkerProcess(self.worker(each)).state for each in self.names("workers")):
             return True
-        found = {each.name for each in self.root.iterdir()} if self.root.is_dir() else set()
+        found = set[str]()
+        with suppress(FileNotFoundError, NotADirectoryError):
+            found = {each.name for each in self.root.iterdir()}
         begun, lock = aside(self.root / CREATED), self.root / LOCK
         return bool(found) and found <= {
             *([begun.name] if _content(begun)[:1] in b"[" else []), *([LOCK] if _content(lock) == LOCK_CONTENT else [])
@@ -150,22 +153,24 @@ class HostFolder:
 
         Creates the folder if needed, or else yields False if it is not ours.
         """
-        while True:
-            if creating:
-                self._create()
-            elif not self.is_ours:
+        for attempt in count():
+            if not creating and not self.is_ours:
                 yield False
                 return
             try:
-                lock = self._open_lock()
+                lock, made, ours = self._enter() if creating else (self._open_lock(), [], True)
             except FileNotFoundError:  # the last holder removed the folder, here and below
+                if attempt > MOST_ATTEMPTS:
+                    raise
                 continue
             with lock:
                 self._acquire(lock.fileno())
                 held = False
                 with suppress(FileNotFoundError):
                     held = os.path.samestat(os.fstat(lock.fileno()), (self.root / LOCK).stat())
-                if held and (not creating or (self.root / CREATED).exists()):
+                if held:
+                    if creating:
+                        self._record(made, ours)
                     self.lock = lock.fileno()
                     yield True
                     return
@@ -194,29 +199,41 @@ class HostFolder:
                 return listed
         return None
 
-    def _create(self) -> None:
-        """Create the folder, with the list of folders that it took; if that fails, none of them stays."""
+    def _enter(self) -> tuple[BinaryIO, list[Path], bool]:
+        """Create the folder if needed, and open its lock; also the folders made for it, and whether it was ours."""
         with suppress(RuntimeError):  # this user has no home
             if Path.home().resolve().is_relative_to(self.root.resolve()):  # people put files of their own there
                 raise FailedError(f"{self.root} is no folder of its own: name another --remote-dir")
-        before, ours = self._taken(), self.is_ours
-        if before and not ours and (strange := self._taken()):  # again: another command may remove the folder
-            raise FailedError(f"{self.root} holds {strange[0]} of something else: name another --remote-dir")
+        for attempt in count():
+            before, ours = self._taken(), self.is_ours
+            if not before or ours or not (strange := self._taken()):
+                break
+            if attempt > 1:
+                raise FailedError(f"{self.root} holds {strange[0]} of something else: name another --remote-dir")
+            time.sleep(TICK)  # another command may make or remove it at this moment
         missing = [each for each in (self.root, *self.root.parents) if not each.exists()]
-        if not missing and (self.root / CREATED).exists():
-            return
         try:
             self.root.mkdir(parents=True, exist_ok=True)
-            made = missing or ([self.root] if ours else [])
-            _write_private(self.root / CREATED, json.dumps([str(each) for each in made]).encode())
-            self._open_lock().close()
-            for name in FOLDERS:  # now, so that what is in one of them later is in a folder of ours
+            return self._open_lock(), missing, ours
+        except OSError:
+            _remove_empty(missing)
+            raise
+
+    def _record(self, made: list[Path], ours: bool) -> None:
+        """List the folders that were `made`, and make those inside, so that what is in them later is in ours."""
+        listed = self._listed()
+        known = ([str(self.root)] if ours else []) if listed is None else listed
+        new = [str(each) for each in made if str(each) not in known]
+        try:
+            if new or listed is None:
+                _write_private(self.root / CREATED, json.dumps([*known, *new]).encode())
+            for name in FOLDERS:
                 (self.root / name).mkdir(exist_ok=True)
         except OSError:
-            if missing:
+            if listed is None:
                 for name in (CREATED, LOCK):
                     (self.root / name).unlink(missing_ok=True)
-                _remove_empty([*(self.root / name for name in FOLDERS), *missing])
+                _remove_empty([*(self.root / name for name in FOLDERS), *made])
             raise
 
     def _taken(self) -> list[str]:
@@ -257,10 +274,11 @@ def aside(path: Path) -> Path:
 
 def _content(path: Path) -> bytes:
     """The beginning of a regular file; empty without one."""
-    if not path.is_file():
-        return b""
-    with path.open("rb") as file:
-        return file.read(LONGEST_LIST)
+    with suppress(FileNotFoundError):  # another command may remove it
+        if path.is_file():
+            with path.open("rb") as file:
+                return file.read(LONGEST_LIST)
+    return b""
 
 
 def remove_tree(folder: Path) -> None:

@@ -96,6 +96,16 @@ def test_an_end_that_waited_for_a_removal_leaves_nothing(tmp_path, monkeypatch, 
     assert not host_folder.root.exists()
 
 
+def test_folders_that_two_commands_make_at_once_are_all_listed_and_removed(tmp_path, capsys):
+    host_folder, other = (HostFolder(str(tmp_path / "share" / "fleet"), Channel()) for _ in range(2))
+    lock, made, ours = host_folder._enter()
+    with lock, other.locked():  # which found the folder made, and was the first to lock it
+        pass
+    host_folder._record(made, ours)
+    assert "ok" in answer(ending({"root": host_folder.root}), capsys)
+    assert [*tmp_path.iterdir()] == []
+
+
 def test_a_folder_that_existed_before_stays_with_its_other_files(tmp_path):
     host_folder = HostFolder(str(tmp_path), Channel())
     (tmp_path / "notes").touch()
