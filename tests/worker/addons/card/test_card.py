@@ -17,7 +17,7 @@ import pytest
 import yaml
 from markdown_it import MarkdownIt
 
-from dreamfleet import evaluate
+from dreamfleet import evaluate, find_controller
 from dreamfleet.common.artifacts.controller import IMPORTED, Controller, ControllerShape
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.printable import one_line
@@ -28,6 +28,7 @@ from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluatio
 from dreamfleet.worker.addons.evaluation.known_score import find_known_score
 from dreamfleet.worker.tasks.registry import find_task
 from tests.support.processes import ROOT
+from tests.support.tasks import TOY
 
 REPORT = ROOT / "docs" / "lab" / "results" / "real.json"
 WITHOUT_DREAMFLEET = (
@@ -61,6 +62,12 @@ def test_the_folder_holds_what_its_card_names(card):
     assert "915.2" in text
     assert read_evaluation_report(card / "evaluation.json") == read_evaluation_report(REPORT)
     assert Controller.load(card / "controller.npz").sha256 in text
+    with av.open(str(card / "replay.mp4")) as video:
+        assert sum(1 for _ in video.decode(video=0)) >= 20
+    assert (card / "scores.png").read_bytes().startswith(b"\x89PNG")
+    graph = onnx.load(card / "controller.onnx", load_external_data=False).graph
+    assert [each.name for each in graph.input] == ["picture", "state"]
+    assert not any(each.external_data for each in graph.initializer)
 
 
 def test_a_hub_reads_the_metadata(card):
@@ -73,30 +80,13 @@ def test_a_hub_reads_the_metadata(card):
     assert (metric["type"], metric["value"]) == ("mean_reward", "915.19 +/- 29.51")
 
 
-def test_the_video_is_a_drive_and_the_picture_a_picture(card):
-    with av.open(str(card / "replay.mp4")) as video:
-        assert sum(1 for _ in video.decode(video=0)) >= 20
-    assert "20" in (card / "README.md").read_text()
-    assert (card / "scores.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_the_graph_needs_no_other_file(card):
-    graph = onnx.load(card / "controller.onnx", load_external_data=False).graph
-    assert [each.name for each in graph.input] == ["picture", "state"]
-    assert not any(each.external_data for each in graph.initializer)
-
-
 @pytest.mark.slow
 def test_the_script_scores_as_evaluate_does(card):
     """To the bit, on a seed that the report has; without dreamfleet."""
     found = run_script(card, 10001)[10001]
     wanted = {each["seed"]: each["score"] for each in json.loads(REPORT.read_text())["drives"]}
     assert found == pytest.approx(wanted[10001], abs=30)  # another processor may round otherwise
-    out = card.parent / "one.json"
-    assert (
-        main(["evaluate", "--controller", "real", "--episodes", "1", "--first-seed", "10001", "--out", str(out)]) == 0
-    )
-    assert found == json.loads(out.read_text())["drives"][0]["score"]
+    assert found == evaluate(find_controller("real"), episodes=1, first_seed=10001, jobs=1).scores[0]
 
 
 @pytest.mark.parametrize(
@@ -128,12 +118,9 @@ def test_a_controller_that_the_script_cannot_drive_has_none(tmp_path):
     assert format_with_error(known.mean, known.error) in scores.partition("## Use")[0]
 
 
-def test_a_report_of_another_controller_is_refused(tmp_path, capsys):
+def test_a_report_of_another_controller_and_a_folder_in_use_are_refused(tmp_path, capsys):
     assert main(["card", "tiny", str(REPORT), "--out", str(tmp_path / "tiny")]) == 2
     assert read_evaluation_report(REPORT).controller[:12] in capsys.readouterr().err
-
-
-def test_a_folder_in_use_is_refused(tmp_path, capsys):
     (tmp_path / "mine").write_text("")
     assert main(["card", "real", "--out", str(tmp_path)]) == 2
     assert "--out" in capsys.readouterr().err
@@ -147,19 +134,11 @@ def test_an_imported_controller_has_a_card(tmp_path):
     assert "`v.npy`" in (tmp_path / "card" / "README.md").read_text()
 
 
-NAMES = [
-    "# <b>x</b>",
-    "[x](javascript:1)",
-    "a`b``c",
-    "1. x*y*_z_",
-    "- x\n# y",
-    "<script>&amp;",
-    "$\\frac$ ~~x~~",
-    "\u202eé",
-]
-
-
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name",
+    ["# <b>x</b>", "[x](javascript:1)", "a`b``c", "1. x*y*_z_", "- x\n# y", "<script>&amp;", "$\\frac$ ~~x~~",
+     "\u202eé"],
+)  # fmt: skip
 def test_a_card_shows_each_name_as_it_is(name):
     controller = Controller(ControllerShape(1, 1), np.zeros(2, np.float32), f"gym:{name}", "", {IMPORTED: name})
     report = replace(read_evaluation_report(REPORT), judge=name, version=name)
@@ -172,9 +151,8 @@ def test_a_card_shows_each_name_as_it_is(name):
     page = page.split("```json")[0]
     title, *elements = ElementTree.fromstring(f"<page>{MarkdownIt('commonmark').render(page)}</page>")
     assert (title.tag, title.text, len(title)) == ("h1", shown, 0)
-    assert {each.tag for element in elements for each in element.iter()} <= {
-        "h2", "p", "ul", "li", "img", "pre", "code", "video",
-    }  # fmt: skip
+    tags = {each.tag for element in elements for each in element.iter()}
+    assert tags <= {"h2", "p", "ul", "li", "img", "pre", "code", "video"}
     assert [each.text for each in elements[0].iter("code")] == [f"gym:{shown}", "dreamfleet", shown]
     scores = "".join(elements[2].itertext())
     assert f"judged in {shown}" in scores
@@ -183,9 +161,7 @@ def test_a_card_shows_each_name_as_it_is(name):
 
 
 def test_what_draws_no_pictures_has_a_card_without_a_video_that_says_why(tmp_path, capsys):
-    shape = ControllerShape(1, 1)
-    name = "tests.support.tasks:Toy"
-    Controller(shape, np.zeros(shape.size, np.float32), name, "").save(tmp_path / "toy.npz")
+    Controller(ControllerShape(1, 1), np.zeros(2, np.float32), TOY, "").save(tmp_path / "toy.npz")
     assert main(["card", str(tmp_path / "toy.npz"), "--out", str(tmp_path / "card")]) == 0
-    assert "tests.support.tasks:Toy" in capsys.readouterr().out
+    assert TOY in capsys.readouterr().out
     assert "<video" not in (tmp_path / "card" / "README.md").read_text()

@@ -1,7 +1,8 @@
-"""Tests loop.py, drive_window.py and scene.py."""
+"""Tests loop.py, drive_window.py, picture_window.py and scene.py."""
 
 import os
 
+import numpy as np
 import pygame
 import pytest
 
@@ -9,6 +10,7 @@ from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import NoDisplayError, UsageError
 from dreamfleet.worker.addons.driving.drive_window import BACKGROUND, DriveStatus, DriveWindow, Pedals
 from dreamfleet.worker.addons.driving.loop import DrivingConfig, drive
+from dreamfleet.worker.addons.driving.picture_window import PictureWindow
 from dreamfleet.worker.addons.driving.scene import DreamScene, make_scene
 
 SEED = 20_003
@@ -56,21 +58,16 @@ class Hand:
         ((pygame.K_UP, pygame.K_w, pygame.K_x), (0, 1, 0)),
     ],
 )
-def test_held_keys_are_an_action(held, action):
-    pedals = Pedals()
-    for code in held:
-        pedals.handle_event(down(code))
-    assert pedals.action() == pytest.approx(action)
-    for code in held:
-        pedals.handle_event(key(pygame.KEYUP, code))
-    assert not pedals.action().any()
-
-
-def test_losing_the_focus_releases_all_keys():
-    pedals = Pedals()
-    pedals.handle_event(down(pygame.K_UP))
-    pedals.handle_event(pygame.event.Event(pygame.WINDOWFOCUSLOST))
-    assert not pedals.action().any()
+def test_held_keys_are_an_action_until_they_are_released_or_the_focus_is_lost(held, action):
+    released = [key(pygame.KEYUP, code) for code in held]
+    for events in (released, [pygame.event.Event(pygame.WINDOWFOCUSLOST)]):
+        pedals = Pedals()
+        for code in held:
+            pedals.handle_event(down(code))
+        assert pedals.action() == pytest.approx(action)
+        for event in events:
+            pedals.handle_event(event)
+        assert not pedals.action().any()
 
 
 def test_holding_up_accelerates_and_q_quits():
@@ -114,10 +111,38 @@ def test_the_longest_text_fits_the_narrowest_window():
         assert pygame.transform.average_color(right)[:3] == BACKGROUND
 
 
-def test_without_a_screen_it_is_an_error(monkeypatch):
+PICTURE = np.full((40, 60, 3), (200, 10, 90), np.uint8)
+
+
+def test_a_picture_window_takes_the_size_of_its_picture_and_keeps_the_last_one():
+    with PictureWindow("night") as screen:
+        assert screen.draw(None)
+        assert screen.draw(PICTURE)
+        assert screen.draw(None)
+        shown = pygame.display.get_surface()
+        assert (shown.get_size(), shown.get_at((30, 20))[:3]) == ((60, 40), (200, 10, 90))
+        assert pygame.display.get_caption()[0] == "dreamfleet: night"
+
+
+@pytest.mark.parametrize("event", [pygame.event.Event(pygame.QUIT), down(pygame.K_q)])
+def test_a_viewer_can_close_it(event):
+    with PictureWindow("night") as screen:
+        assert screen.draw(PICTURE)
+        pygame.event.post(event)
+        assert not screen.draw(PICTURE)
+
+
+def test_its_title_takes_a_name_that_is_no_utf_8():
+    with PictureWindow("\udcff\udc80"):
+        assert pygame.display.get_caption()[0] == "dreamfleet: \\udcff\\udc80"
+
+
+def test_without_a_screen_a_window_is_an_error(monkeypatch):
     for name in ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     pygame.display.quit()
+    with pytest.raises(NoDisplayError, match=r"--out.*live\.mp4"), PictureWindow("night"):
+        pass
     if os.path.exists("/dev/dri"):  # noqa: PTH110
         pytest.skip("a screen may answer without DISPLAY here")
     with pytest.raises(NoDisplayError):
@@ -131,6 +156,6 @@ def test_invalid_arguments_are_refused(arguments):
         DrivingConfig(**arguments)
 
 
-def test_a_world_model_without_a_dream_is_refused(capsys):
+def test_a_dreams_temperature_without_a_dream_is_refused(capsys):
     assert main(["drive", "--temperature", "0.5"]) == UsageError.exit_code
     assert "--dream" in capsys.readouterr().err

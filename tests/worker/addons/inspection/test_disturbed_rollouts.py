@@ -1,6 +1,7 @@
 """Disturbed drives with the true state beside the world model's. Tests drivers.py."""
 
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -26,12 +27,22 @@ from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
 from tests.support.tasks import TOY
 
+SMALL, RNN = VAEConfig(latent=5, channels=(4, 4, 4, 8)), MDNRNNConfig(latent=5, hidden=8)
+
+
+def drives(bundle, actors, **config):
+    recurrent = RecurrentState(bundle)
+    config = DisturbedDriveConfig(**config)
+    return record_disturbed_drives(bundle, recurrent, lambda seed: actors(recurrent, seed), config)
+
 
 def drive(bundle, actors, **config):
-    recurrent = RecurrentState(bundle)
-    return next(
-        record_disturbed_drives(bundle, recurrent, lambda seed: actors(recurrent, seed), DisturbedDriveConfig(**config))
-    )
+    return next(drives(bundle, actors, **config))
+
+
+def drivers(name, bundle):
+    actors = make_driver_actors(bundle, name)
+    return lambda _recurrent, seed: actors(seed)
 
 
 def test_without_noise_a_controller_drives_as_its_policy_does(tiny, controller):
@@ -40,9 +51,11 @@ def test_without_noise_a_controller_drives_as_its_policy_does(tiny, controller):
     policy.begin(controller.parameters)
     moments = list(run_episode(environment, policy, EpisodeConfig(20_002, 60)))
     environment.close()
-    seen = drive(
-        tiny, lambda recurrent, _: ControllerActor(controller, tiny, recurrent), noise=0, steps=60, first_seed=20_002
-    )
+
+    def actor(recurrent, _seed):
+        return ControllerActor(controller, tiny, recurrent)
+
+    seen = drive(tiny, actor, noise=0, steps=60, first_seed=20_002)
     np.testing.assert_allclose(seen.action, [each.action for each in moments], atol=1e-5)
     assert seen.reward.tolist() == [each.reward for each in moments]
     assert seen.features.shape == (60, 32 + 256)
@@ -60,33 +73,23 @@ def test_a_drive_ends_behind_its_loss_and_is_a_function_of_its_seed(tiny):
     assert np.array_equal(one.action, other.action)
 
 
-def drivers(name, bundle):
-    actors = make_driver_actors(bundle, name)
-    return lambda _recurrent, seed: actors(seed)
-
-
 def test_a_controller_of_another_world_model_drives_by_its_own(tiny, controller, tmp_path):
-    small = VAEConfig(latent=5, channels=(4, 4, 4, 8))
-    watching = write_random_bundle(tmp_path / "small.zip", vae=small, rnn=MDNRNNConfig(latent=5, hidden=8))
-    config = {"noise": 0.1, "steps": 30}
-    watched = drive(
-        watching, lambda recurrent, _: make_controller_actor(controller, tiny, watching, recurrent), **config
-    )
-    driven = drive(tiny, lambda recurrent, _: make_controller_actor(controller, tiny, tiny, recurrent), **config)
+    def watched_by(bundle, recurrent, _seed):
+        return make_controller_actor(controller, tiny, bundle, recurrent)
+
+    watching = write_random_bundle(tmp_path / "small.zip", vae=SMALL, rnn=RNN)
+    watched, driven = (drive(each, partial(watched_by, each), noise=0.1, steps=30) for each in (watching, tiny))
     assert watched.features.shape == (30, 13)
     assert np.array_equal(watched.action, driven.action)
-    whole = VAEConfig(picture=96, padding="same", latent=5, channels=(2, 2, 2, 2))
-    other = write_random_bundle(tmp_path / "whole.zip", vae=whole, rnn=MDNRNNConfig(latent=5, hidden=8))
+    whole = replace(SMALL, picture=96, padding="same")
+    other = write_random_bundle(tmp_path / "whole.zip", vae=whole, rnn=RNN)
     with pytest.raises(ControllerError, match=r"box-64.*car-racing.*raw-96"):
         make_controller_actor(controller, tiny, other, RecurrentState(other))
 
 
-def test_all_drivers_of_data_sets_drive_for_a_probe(tiny):
+def test_all_drivers_of_data_sets_drive_for_a_probe_and_no_others(tiny):
     for name in ("random", *known_drivers()):
         assert drive(tiny, drivers(name, tiny), steps=3).action.shape == (3, 3)
-
-
-def test_a_driver_that_there_is_not_is_named_with_those_that_there_are(tiny):
     with pytest.raises(UsageError, match="'ghost'"):
         make_driver_actors(tiny, "ghost")
 
@@ -99,32 +102,23 @@ def test_a_road_is_lost_where_the_car_is_off_it_for_long_enough(off, first):
 
 
 def test_tracks_follow_each_other(tiny):
-    actors = make_driver_actors(tiny, "held")
-    drives = list(
-        islice(
-            record_disturbed_drives(
-                tiny, RecurrentState(tiny), actors, DisturbedDriveConfig(steps=3, first_seed=20_007)
-            ),
-            2,
-        )
-    )
-    assert [each.seed for each in drives] == [20_007, 20_008]
-    assert not np.array_equal(drives[0].latent, drives[1].latent)
+    one, other = islice(drives(tiny, drivers("held", tiny), steps=3, first_seed=20_007), 2)
+    assert (one.seed, other.seed) == (20_007, 20_008)
+    assert not np.array_equal(one.latent, other.latent)
 
 
 def test_a_driver_that_never_comes_far_begins_anywhere(tiny):
-    places = [
-        drive(tiny, drivers("held", tiny), steps=2, first_seed=20_000, anywhere=each) for each in (False, True, True)
-    ]
-    start, one, other = (each.truth for each in places)
-    assert abs(start["lateral_offset"][0]) < 0.01 < abs(one["lateral_offset"][0])
-    assert one["lateral_offset"][0] == other["lateral_offset"][0]
+    start, one, other = (
+        drive(tiny, drivers("held", tiny), steps=2, first_seed=20_000, anywhere=each).truth["lateral_offset"][0]
+        for each in (False, True, True)
+    )
+    assert abs(start) < 0.01 < abs(one)
+    assert one == other
 
 
 def test_a_world_without_true_state_is_reported(tmp_path):
-    small = VAEConfig(latent=5, channels=(4, 4, 4, 8))
-    ours = write_random_bundle(tmp_path / "ours.zip", vae=small, rnn=MDNRNNConfig(latent=5, hidden=8))
+    ours = write_random_bundle(tmp_path / "ours.zip", vae=SMALL, rnn=RNN)
     parts = {name: ours.read(name) for name in ours.manifest.parts}
     toy = write_bundle(tmp_path / "toy.zip", replace(ours.manifest, task=TOY, world=ours.manifest.facts), parts)
     with pytest.raises(UsageError):
-        next(record_disturbed_drives(toy, RecurrentState(toy), lambda _seed: None, DisturbedDriveConfig()))
+        drive(toy, drivers)

@@ -18,16 +18,6 @@ FOUND = {"z_linear", "z_network", "zh_linear", "zh_network"}
 
 
 @pytest.mark.slow
-def test_a_probe_prints_a_row_a_quantity(call):
-    lines = call("tiny", "--probe", "--controller", "tiny", "--episodes", "2").splitlines()
-    assert cells(lines[0]) == [
-        "quantity", "deviation", "z, linear", "z, network", "[z, h], linear", "[z, h], network",
-    ]  # fmt: skip
-    assert {"lateral_offset", "speed", "curvature_40m"} < {cells(line)[0] for line in lines}
-    assert "2 drives" in lines[-1]
-
-
-@pytest.mark.slow
 def test_a_driver_drives_without_a_controller(call):
     found = json.loads(call("tiny", "--probe", "--driver", "ornstein-uhlenbeck", "--episodes", "8", "--json"))
     assert found["driver"] == "ornstein-uhlenbeck"

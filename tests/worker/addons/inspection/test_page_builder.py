@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from dreamfleet.common.artifacts.bundle import write_bundle
 from dreamfleet.common.errors import BundleError, DatasetError, UsageError
 from dreamfleet.worker.addons.inspection import mdnrnn_sections
 from dreamfleet.worker.addons.inspection.encoded_rollout import DriveConfig, record_drive
@@ -28,7 +27,7 @@ LOOKS = ["reconstructions", "traversals", "latents", "samples"]
 
 
 class Links(HTMLParser):
-    """Collects the addresses that a browser would fetch, and the ids of the sections."""
+    """Collects the tags, the addresses that a browser would fetch, and the ids of the sections."""
 
     def __init__(self, text):
         super().__init__()
@@ -36,11 +35,9 @@ class Links(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag, attributes):
-        named = dict(attributes)
         self.tags.add(tag)
         self.addresses += [value for name, value in attributes if name in ("src", "href", "srcset", "data", "action")]
-        if tag == "section":
-            self.sections.append(named["id"])
+        self.sections += [dict(attributes)["id"]] if tag == "section" else []
 
 
 def write_curves(folder):
@@ -58,25 +55,16 @@ def test_the_pages_drive_can_be_one_action_alone(attentive):
     driven = record_drive(attentive, None, DriveConfig(steps=12, action=(-0.01, 1.0, 0.0)))
     assert driven.action.tolist() == [np.array((-0.01, 1, 0), np.float32).tolist()] * 12
     assert driven.description.endswith("-0.01 1 0")
-
-
-@pytest.mark.parametrize("action", [(1.0,), (0.0, 2.0, 0.0), (0.0, float("nan"), 0.0), (0.0, 1e40, 0.0)])
-def test_what_is_no_action_of_the_world_is_refused(attentive, action):
-    with pytest.raises(UsageError):
-        record_drive(attentive, None, DriveConfig(action=action))
+    for wrong in ((1.0,), (0.0, 2.0, 0.0), (0.0, float("nan"), 0.0), (0.0, 1e40, 0.0)):
+        with pytest.raises(UsageError):
+            record_drive(attentive, None, DriveConfig(action=wrong))
 
 
 @pytest.mark.slow
 def test_a_page_has_every_section_and_needs_nothing_else(attentive, tmp_path):
     write_curves(tmp_path)
-    sections = []
-    page = write_page(
-        InspectionSubject(attentive),
-        tmp_path / "out",
-        SHORT,
-        [tmp_path],
-        lambda done, name: sections.append((done, name)),
-    )
+    sections, subject = [], InspectionSubject(attentive)
+    page = write_page(subject, tmp_path / "out", SHORT, [tmp_path], lambda *done: sections.append(done))
     found = Links(page.read_text())
     names = [*LOOKS, "dream", "rewards", "attention", "loss-vae", "loss-mdnrnn"]
     assert found.sections == names
@@ -90,18 +78,18 @@ def test_a_page_has_every_section_and_needs_nothing_else(attentive, tmp_path):
 
 
 @pytest.mark.slow
-def test_what_a_bundle_cannot_do_is_left_out(tmp_path):
+def test_what_a_bundle_cannot_do_is_left_out_and_a_drive_is_seen_as_it_sees(tmp_path):
+    whole = VAEConfig(picture=96, padding="same", latent=5, channels=(2, 2, 2, 2))
     rnn = MDNRNNConfig(latent=5, hidden=8, reward="none")
-    plain = write_random_bundle(tmp_path / "plain.zip", vae=VAE, rnn=rnn)
+    plain = write_random_bundle(tmp_path / "plain.zip", vae=whole, rnn=rnn)
     page = write_page(InspectionSubject(plain), tmp_path / "plain", SHORT)
     assert Links(page.read_text()).sections == [*LOOKS, "dream"]
+    assert record_drive(plain, None, SHORT).picture.shape == (12, 96, 96, 3)
 
 
-def test_the_table_has_sizes_and_quality(tmp_path, attentive):
-    provenance = {"quality": {"reward_auc": 0.9}, "held_out_episodes": 7}
-    manifest = attentive.manifest.__class__(**{**vars(attentive.manifest), "provenance": provenance})
-    parts = {name: attentive.read(name) for name in attentive.manifest.parts}
-    rows = dict(manifest_facts(write_bundle(tmp_path / "b.zip", manifest, parts)))
+def test_the_table_has_sizes_and_quality(attentive):
+    attentive.manifest.provenance.update({"quality": {"reward_auc": 0.9}, "held_out_episodes": 7})
+    rows = dict(manifest_facts(attentive))
     assert rows["quality: reward auc"] == "0.9 (0.5 is chance, 1 exact)"
     assert (rows["latents"], rows["attention window"], rows["held out episodes"]) == ("5", "3", "7")
 
@@ -142,20 +130,10 @@ def test_attention_is_that_of_the_trained_model(attentive):
     np.testing.assert_allclose(DreamStep(attentive).attend(latent, action, state), expected.numpy(), atol=1e-6)
 
 
-@pytest.mark.slow
-def test_a_drive_is_seen_as_its_bundle_sees(tmp_path):
-    whole = VAEConfig(picture=96, padding="same", latent=5, channels=(2, 2, 2, 2))
-    bundle = write_random_bundle(tmp_path / "whole.zip", vae=whole, rnn=MDNRNNConfig(latent=5, hidden=4))
-    assert record_drive(bundle, None, SHORT).picture.shape == (12, 96, 96, 3)
-    page = write_page(InspectionSubject(bundle), tmp_path / "out", SHORT)
-    assert Links(page.read_text()).sections == [*LOOKS, "dream", "rewards"]
-
-
 def test_what_is_missing_is_reported_before_anything_is_driven(tmp_path, attentive):
     with pytest.raises(BundleError, match=r"'nosuch'.*'nosuch'"), find_subject("nosuch", tmp_path):
         pass
-    with pytest.raises(DatasetError):
-        write_page(InspectionSubject(attentive), tmp_path / "out", SHORT, [tmp_path / "nowhere"])
     (tmp_path / "file").write_text("")
-    with pytest.raises(DatasetError, match="--out"):
-        write_page(InspectionSubject(attentive), tmp_path / "file" / "out", SHORT)
+    for named, out, data in (("--data", "out", [tmp_path / "nowhere"]), ("--out", "file/out", [])):
+        with pytest.raises(DatasetError, match=named):
+            write_page(InspectionSubject(attentive), tmp_path / out, SHORT, data)

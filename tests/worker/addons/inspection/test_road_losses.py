@@ -1,15 +1,17 @@
 """Dreams begun before real losses of the road, judged by probes on the dream.
-Tests likeness.py and tables.py."""
+Tests drive_dreams.py, likeness.py and tables.py."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.addons.inspection import likeness, probe
 from dreamfleet.worker.addons.inspection.disturbed_rollouts import OFF, DisturbedDriveConfig, record_disturbed_drives
 from dreamfleet.worker.addons.inspection.drive_dreams import DreamSegment, DriveDreamer
+from dreamfleet.worker.addons.inspection.measurements import DriverChoice
 from dreamfleet.worker.addons.inspection.probe import cross_validate_probes
 from dreamfleet.worker.addons.inspection.road_losses import (
     CALM,
@@ -22,6 +24,8 @@ from dreamfleet.worker.addons.inspection.road_losses import (
 from dreamfleet.worker.addons.inspection.tables import table_of
 from dreamfleet.worker.scoring.actors import ControllerActor
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
+from tests.support.bundles import write_random_bundle
+from tests.support.variants import controller_of
 
 CONFIG, DRIVEN = RoadLossConfig(losses=6, before=(20, 0), dreams=2), DisturbedDriveConfig(opening=50)
 
@@ -34,16 +38,12 @@ def drives(tiny, controller):
 
 
 @pytest.mark.slow
-def test_as_many_losses_are_gathered_as_are_wanted(drives):
+def test_as_many_losses_are_gathered_as_are_wanted_and_too_few_are_reported(drives):
     lost = [each for each in drives if each.lost is not None]
     assert len(lost) >= CONFIG.losses
     assert drives[-1].lost is not None
     for each in lost:
         assert each.truth[OFF][each.lost : each.lost + DRIVEN.lasting].all()
-
-
-@pytest.mark.slow
-def test_too_few_losses_are_reported(drives):
     calm = [replace(each, lost=None) for each in drives]
     with pytest.raises(UsageError, match="--noise"):
         collect_losing_drives(iter(calm), CONFIG, DRIVEN)
@@ -71,33 +71,25 @@ def test_reality_loses_the_road_and_the_probe_sees_it_and_nothing_where_all_is_c
 def test_a_dream_begins_at_its_real_step_and_is_a_function_of_seed_and_step(drives, tiny, controller):
     dreamer, begun = DriveDreamer(tiny, controller, 1.0, 3), DreamSegment(drives[0], 120, 15)
     features, rewards = dreamer.dream(begun, own=True)
-    assert features.shape == (3, 15, 288)
-    assert rewards.shape == (3, 15)
+    assert (features.shape, rewards.shape) == ((3, 15, 288), (3, 15))
     assert (features[:, 0] == drives[0].features[120]).all()
     assert not np.array_equal(features[0, 1:], features[1, 1:])
     assert np.array_equal(features, dreamer.dream(begun, own=True)[0])
-    assert not np.array_equal(features, dreamer.dream(DreamSegment(drives[0], 121, 15), own=True)[0])
+    calm = replace(drives[0], push=np.zeros_like(drives[0].push))
+    for other in (DreamSegment(drives[0], 121, 15), DreamSegment(calm, 120, 15)):  # it is pushed as reality was
+        assert not np.array_equal(features, dreamer.dream(other, own=True)[0])
 
 
 def test_in_a_dream_of_the_same_actions_nobody_chooses(drives, tiny, controller):
-    other = replace(controller, parameters=-controller.parameters)
-    begun = DreamSegment(drives[0], 120, 15)
+    other, begun = replace(controller, parameters=-controller.parameters), DreamSegment(drives[0], 120, 15)
     one, another = (DriveDreamer(tiny, each, 1.0, 2) for each in (controller, other))
-    assert np.array_equal(one.dream(begun, own=False)[0], another.dream(begun, own=False)[0])
-    assert not np.array_equal(one.dream(begun, own=True)[0], another.dream(begun, own=True)[0])
-
-
-def test_the_controllers_dream_is_pushed_as_reality_was(drives, tiny, controller):
-    calm = replace(drives[0], push=np.zeros_like(drives[0].push))
-    dreamer = DriveDreamer(tiny, controller, 1.0, 2)
-    found = [dreamer.dream(DreamSegment(each, 120, 15), own=True)[0] for each in (drives[0], calm)]
-    assert not np.array_equal(*found)
+    for own in (False, True):
+        assert np.array_equal(one.dream(begun, own=own)[0], another.dream(begun, own=own)[0]) == (not own)
 
 
 def test_what_is_foreseen_has_the_memory_of_reality(drives, tiny, controller):
     features, rewards = DriveDreamer(tiny, controller, 1.0, 1).predict_next(drives[0])
-    assert features.shape == drives[0].features.shape
-    assert rewards.shape == drives[0].reward.shape
+    assert (features.shape, rewards.shape) == (drives[0].features.shape, drives[0].reward.shape)
     assert np.array_equal(features[:, 32:], drives[0].features[:, 32:])
     assert np.array_equal(features[0], drives[0].features[0])
     near = [np.corrcoef(features[50:, row], drives[0].features[50:, row])[0, 1] for row in range(32)]
@@ -134,7 +126,7 @@ def test_a_world_model_knows_yaw_from_what_it_remembers_not_from_a_picture(drive
 
 
 @pytest.mark.slow
-def test_a_dream_is_held_to_what_is_rare_in_reality(drives, tiny, controller):
+def test_a_dream_is_held_to_what_is_rare_in_reality(drives, tiny, controller, monkeypatch):
     report = likeness.compare_frequencies(drives, tiny, controller, DRIVEN.opening, 2, 1.0)
     found = {each.quantity: each for each in report.quantities}
     assert OFF not in found
@@ -145,12 +137,8 @@ def test_a_dream_is_held_to_what_is_rare_in_reality(drives, tiny, controller):
     assert found["speed"].rare > 20
     with pytest.raises(UsageError, match="100"):
         likeness.compare_frequencies(drives[:1], tiny, controller, DRIVEN.opening, 2, 1.0)
-
-
-@pytest.mark.slow
-def test_dreams_that_all_end_as_they_begin_are_refused(drives, tiny, controller, monkeypatch):
     monkeypatch.setattr(likeness, "_before_ends", lambda features: features[0, :0])
-    with pytest.raises(UsageError):
+    with pytest.raises(UsageError):  # all dreams end as they begin
         likeness.compare_frequencies(drives, tiny, controller, DRIVEN.opening, 2, 1.0)
 
 
@@ -161,18 +149,56 @@ def test_steps_behind_a_dreams_end_do_not_count():
 
 
 def test_one_drive_is_too_few_to_fit_and_judge(drives):
-    with pytest.raises(UsageError):
-        cross_validate_probes(drives[:1], DRIVEN.opening)
-    with pytest.raises(UsageError):
-        cross_validate_probes([], DRIVEN.opening)
-    with pytest.raises(UsageError):
-        cross_validate_probes(drives, max(len(each) for each in drives))
+    for few, opening in ((drives[:1], DRIVEN.opening), ([], DRIVEN.opening), (drives, max(map(len, drives)))):
+        with pytest.raises(UsageError):
+            cross_validate_probes(few, opening)
 
 
 def test_a_drive_that_ended_in_the_opening_is_no_drive_to_judge(drives, monkeypatch):
     monkeypatch.setattr(probe, "UPDATES", 30)
-    short = replace(drives[0], truth={name: column[:20] for name, column in drives[0].truth.items()},
-                    action=drives[0].action[:20])  # fmt: skip
+    truth = {name: column[:20] for name, column in drives[0].truth.items()}
+    short = replace(drives[0], truth=truth, action=drives[0].action[:20])
     one, other = (cross_validate_probes(each, DRIVEN.opening) for each in ([short, *drives[:2], short], drives[:2]))
     assert one.known == other.known
     assert (one.drives, one.steps) == (other.drives, other.steps)
+
+
+VARIANT = Variant(pedals="one", pedal_shift=0.25, decide_every=3, feedback="last")
+
+
+def witnessed(observing_model, own, noise):
+    """A drive of eleven steps by a controller of `own`, observed by `watching`."""
+    driving = DriverChoice(controller_of(own.with_controllers(None, VARIANT)), own)
+    recurrent = RecurrentState(driving.observing_model(observing_model))
+    drives = record_disturbed_drives(
+        observing_model, recurrent, driving.actors(observing_model, recurrent), DisturbedDriveConfig(noise, steps=11)
+    )
+    drive = next(drives)
+    drives.close()
+    return drive, driving.controller
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_a_choice_is_held_whatever_is_pushed_meanwhile(random_bundle, noise):
+    drive, _ = witnessed(random_bundle, random_bundle, noise)
+    assert drive.state[:, -1].tolist() == [0, 1, 2] * 3 + [0, 1]
+    choices = drive.state[:, -7:-4]
+    for begun in (1, 4, 7):
+        assert (choices[begun : begun + 3] == choices[begun]).all()
+    calm = np.array_equal(drive.action[:9].reshape(3, 3, 3)[:, 0], choices[[1, 4, 7]])
+    assert calm == (noise == 0)
+
+
+def test_a_dream_that_begins_between_two_choices_holds_on_to_the_one_before(random_bundle):
+    drive, controller = witnessed(random_bundle, random_bundle, 0.0)
+    dreamer, begun = DriveDreamer(random_bundle, controller, 1.0, 2), DreamSegment(drive, 4, 6)
+    own, same = (dreamer.dream(begun, own=each)[0] for each in (True, False))
+    assert np.array_equal(own[:, :3], same[:, :3]), "steps 4 and 5 do what step 3 chose"
+    assert not np.array_equal(own[:, 4:], same[:, 4:])
+
+
+def test_another_world_model_may_look_on(random_bundle, tmp_path):
+    other = write_random_bundle(tmp_path / "other.zip", seed=9)
+    drive, _ = witnessed(other, random_bundle, 0.0)
+    assert drive.state.shape == (11, 512)
+    assert np.array_equal(drive.action, witnessed(random_bundle, random_bundle, 0.0)[0].action)

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.bundle_store import find_bundle
-from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.runs.lookup import find_controller
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
-from dreamfleet.common.runs.run_paths import CONTROLLER, run_paths
+from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.work import vector_bytes
 from dreamfleet.coordinator.storage.journal import Journal
@@ -19,6 +18,7 @@ from dreamfleet.worker.addons.inspection.page_builder import find_subject, write
 from dreamfleet.worker.addons.inspection.probe import Estimate
 from dreamfleet.worker.addons.inspection.road_losses import LossReport, RoadLossComparison
 from tests.support.samples import SPEC
+from tests.support.variants import controller_of
 from tests.support.verbs import run_verb
 
 COMPARED = RoadLossComparison("40 steps before", 30, {"lost": {"reality": Estimate(1.0, 0.0)}})
@@ -29,9 +29,8 @@ def runs_dir(tmp_path, random_bundle):
     path = tmp_path / "runs" / "night"
     path.mkdir(parents=True)
     shape = random_bundle.controller_shape
-    settings = RunSettings(
-        replace(SPEC, bundle=random_bundle.sha256, temperature=1.25), shape, 2, 1, 0.1, "diagonal", 1, 1, 2
-    )
+    spec = replace(SPEC, bundle=random_bundle.sha256, temperature=1.25)
+    settings = RunSettings(spec, shape, 2, 1, 0.1, "diagonal", 1, 1, 2)
     journal = Journal.create(path, settings, random_bundle.path)
     vectors = [vector_bytes(np.full(shape.size, value)) for value in (0.5, 1.5)]
     for number in range(3):
@@ -45,23 +44,23 @@ def runs_dir(tmp_path, random_bundle):
     return tmp_path / "runs"
 
 
-@pytest.mark.slow
-def test_a_run_that_goes_on_is_driven_at_random_and_shows_its_fitness(runs_dir, tmp_path):
-    with find_subject("night", runs_dir) as subject:
-        page = write_page(subject, tmp_path / "out", DriveConfig(steps=4)).read_text()
-    assert 'id="fitness"' in page
-    assert "random driver" in page
+def end(runs_dir, bundle):
+    """Keep a controller of the run, which has ended."""
+    controller = controller_of(bundle, "dream")
+    controller.save(runs_dir / "night" / CONTROLLER)
+    return controller
 
 
 @pytest.mark.slow
-def test_a_run_that_has_ended_is_driven_by_its_controller(runs_dir, random_bundle, tmp_path):
-    shape = random_bundle.controller_shape
-    parameters = np.random.default_rng(0).normal(size=shape.size).astype(np.float32)
-    Controller(shape, parameters, "dream", random_bundle.sha256).save(next(run_paths(runs_dir)) / CONTROLLER)
+def test_a_run_that_goes_on_is_driven_at_random_and_one_that_has_ended_by_its_controller(
+    runs_dir, random_bundle, tmp_path
+):
     with find_subject("night", runs_dir) as subject:
-        assert np.array_equal(subject.controller.parameters, parameters)
-        page = write_page(subject, tmp_path / "out", DriveConfig(steps=4)).read_text()
-    assert "random driver" not in page
+        assert subject.controller is None
+        assert 'id="fitness"' in write_page(subject, tmp_path / "out", DriveConfig(steps=4)).read_text()
+    controller = end(runs_dir, random_bundle)
+    with find_subject("night", runs_dir) as subject:
+        assert subject.controller.sha256 == controller.sha256
 
 
 def test_a_bundle_is_shown_a_drive_of_another_ones_controller(random_bundle, tmp_path):
@@ -69,20 +68,14 @@ def test_a_bundle_is_shown_a_drive_of_another_ones_controller(random_bundle, tmp
     own = find_bundle("tiny")
     seen, driven = (record_drive(each, controller, DriveConfig(steps=30), own) for each in (random_bundle, own))
     assert np.array_equal(seen.action, driven.action)
-    assert seen.mu.shape != driven.mu.shape or not np.array_equal(seen.mu, driven.mu)
+    assert not np.array_equal(seen.mu, driven.mu)
 
 
-def test_a_runs_own_controller_is_measured_at_the_runs_temperature(runs_dir, random_bundle, tmp_path, monkeypatch):
+def test_a_runs_own_controller_is_measured_at_the_runs_temperature(runs_dir, random_bundle, monkeypatch):
     asked = []
-    monkeypatch.setattr(
-        measurements,
-        "measure_dream_losses",
-        lambda *given: asked.append(given) or LossReport(1, 8, 1.0, 10, (COMPARED,)),
-    )
-    shape = random_bundle.controller_shape
-    Controller(shape, np.zeros(shape.size, np.float32), "dream", random_bundle.sha256).save(
-        next(run_paths(runs_dir)) / CONTROLLER
-    )
+    report = LossReport(1, 8, 1.0, 10, (COMPARED,))
+    monkeypatch.setattr(measurements, "measure_dream_losses", lambda *given: asked.append(given) or report)
+    end(runs_dir, random_bundle)
     for flags, temperature in ((), 1.25), (("--temperature", "1.5"), 1.5):
         assert run_verb(verb, "night", "--losses", *flags, runs_dir=runs_dir) == 0
         bundle, driving, _, losses, _ = asked.pop()

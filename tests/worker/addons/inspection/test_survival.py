@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.actions import Continuous
-from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.addons.inspection import encoded_rollout
@@ -26,6 +25,7 @@ from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle, write_world_bundle
 from tests.support.pixel_world import Dodge, DodgeTask
 from tests.support.tables import cells
+from tests.support.variants import controller_of
 
 VAE, ENDING = VAEConfig(latent=5, channels=(4, 4, 4, 8)), MDNRNNConfig(latent=5, hidden=8, reward="none", done=True)
 FACTS = DodgeTask.world.facts(RewardFacts("survival"), EndRule("drawn"))
@@ -49,16 +49,9 @@ def closed(monkeypatch):
     return found
 
 
-def controller_of(bundle):
-    shape = bundle.controller_shape
-    return Controller(
-        shape, np.random.default_rng(0).normal(size=shape.size).astype(np.float32), "dream", bundle.sha256
-    )
-
-
 def test_each_choice_each_driver_and_the_controller_live_in_both(dodge, closed):
     counts = []
-    found = measure_survival(dodge, controller_of(dodge), SurvivalConfig(3, first_seed=7), counts.append)
+    found = measure_survival(dodge, controller_of(dodge, "dream"), SurvivalConfig(3, first_seed=7), counts.append)
     assert [each.policy for each in found.policies] == [*NAMES, "controller"]
     assert counts == [*range(1, 19), *range(21, 37, 3)], "episodes of six policies, then of their dreams"
     assert (found.limit, found.end, len(closed)) == (200, "drawn", 1)
@@ -101,7 +94,7 @@ def test_a_model_without_ends_and_a_stranger_are_refused(dodge, tmp_path):
     with pytest.raises(UsageError, match=r"endless\.zip.*--set"):
         measure_survival(endless, None, SurvivalConfig(2))
     with pytest.raises(UsageError):
-        measure_survival(dodge, controller_of(endless), SurvivalConfig(2))
+        measure_survival(dodge, controller_of(endless, "dream"), SurvivalConfig(2))
 
 
 def test_the_verb_prints_a_row_a_policy_or_json(dodge, call):
@@ -116,14 +109,11 @@ def test_the_verb_prints_a_row_a_policy_or_json(dodge, call):
 
 @pytest.mark.slow
 def test_a_page_shows_a_world_of_choices(dodge, tmp_path, closed):
-    page = write_page(InspectionSubject(dodge, controller_of(dodge)), tmp_path / "page", DriveConfig(steps=12))
-    text = page.read_text()
+    page = write_page(InspectionSubject(dodge, controller_of(dodge, "dream")), tmp_path / "page", DriveConfig(steps=12))
     assert (page.parent / "ends.png").exists()
     assert not (page.parent / "rewards.png").exists(), "it predicts none"
-    assert "CarRacing" not in text
-    assert "opening" not in text
-    facts = dict(manifest_facts(dodge))
-    assert facts["task"] == DodgeTask.name
+    assert "CarRacing" not in page.read_text()
+    assert dict(manifest_facts(dodge))["task"] == DodgeTask.name
     assert len(closed) == 1
 
 
