@@ -45,7 +45,7 @@ class IssuedJoinFile:
 
 @dataclass(frozen=True)
 class CertificateLedger:
-    """All join files that one authority issued, oldest first."""
+    """The join files that one authority issued, oldest first; of those that expired, revoked ones and names' last."""
 
     authority: str  # hash of its certificate
     passwords: bool = False

@@ -3,19 +3,19 @@
 import subprocess
 import sys
 from contextlib import nullcontext
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from itertools import chain, repeat
+from unittest.mock import Mock
 
 import pytest
 
 from dreamfleet.common.errors import AccessError, ConnectionFailedError
 from dreamfleet.common.security.credentials import Credentials
 from dreamfleet.common.transport.session import Network, open_session
-from dreamfleet.worker.service import membership
+from dreamfleet.worker.service import membership, worker
 from dreamfleet.worker.service.config import WorkerConfig
 from dreamfleet.worker.service.worker import Worker
 from tests.support import tasks
-from tests.support.access import Access
 from tests.support.hand import DEADLINE
 from tests.support.processes import free_port
 from tests.support.stage import drained, wait_for
@@ -111,10 +111,12 @@ def test_its_lifetime_ends_without_a_run_too(stage, coordinator):
     assert served.result(DEADLINE) is None
 
 
-def test_a_worker_whose_host_slept_past_the_end_of_its_join_file_leaves(stage, tmp_path, monkeypatch):
+def test_a_worker_whose_host_slept_past_the_end_of_its_join_file_leaves(stage, monkeypatch):
     left = chain([timedelta(days=2)] * 3, repeat(timedelta(days=-1)))
     monkeypatch.setattr(Credentials, "time_left", property(lambda _: next(left)))
-    network = Access(tmp_path).network("first", f"tls/127.0.0.1:{free_port()}")
+    monkeypatch.setattr(worker, "open_session", Mock(side_effect=ConnectionFailedError))
+    credentials = Credentials("worker", 1, "first", datetime.now(UTC), ca="")
+    network = Network(connect=(f"tls/127.0.0.1:{free_port()}",), credentials=credentials)
     assert isinstance(stage.worker(network=network)[1].exception(DEADLINE), AccessError)
 
 
