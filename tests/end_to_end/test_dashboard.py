@@ -54,7 +54,7 @@ def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes,
     wait(page, "no coordinator")
     assert processes.endpoint in part(page, "sentence")
     wait(page, "dreamfleet coordinator --run NAME", "task")
-    left = processes.coordinator(*small)
+    left = processes.coordinator(*small, "--episodes", 2)
     wait(page, "waiting for workers")
     assert processes.call("pause", "test", "--connect", processes.endpoint)[0] == 0
     wait(page, "By hand", "sentence")
@@ -68,7 +68,7 @@ def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes,
     assert part(page, "run") == "test"
     worker = processes.worker("--task", tasks.SLOW_TOY, "--name", "alpha")
     wait(page, "running")
-    drawn(page, "Generation 1:")
+    drawn(page, "Generation ")  # a busy browser skips some
     assert page.locator("[data-part=fitness] .scatterlayer .trace").count() >= 3
     assert page.locator("[data-part=cells] .cell").count() == 4
     assert "of 1,000 generations" in part(page, "eta")
