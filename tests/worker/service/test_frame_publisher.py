@@ -60,10 +60,19 @@ def viewer():
 
 
 @pytest.mark.slow
-def test_a_viewer_sees_the_running_job_of_one_slot_and_its_observation(stage, hand, cached, viewer):
+def test_one_of_two_slots_is_shown(stage, hand, cached, viewer):
     stage.worker(slots=2)
     hand.hello()
     hand.beat(lambda beat: beat.capacity == 2)
+    watching = viewer(hand)
+    hand.send(1, *(hand.job(episode) for episode in range(6)))
+    assert {watching.frame().slot for _ in range(5)} == {0}
+
+
+@pytest.mark.slow
+def test_a_viewer_sees_the_running_job_and_its_observation(stage, hand, cached, viewer):
+    stage.worker()
+    hand.ready()
     watching = viewer(hand)
     jobs = hand.job(0), hand.job(1), hand.job(2)
     hand.send(1, *jobs)
