@@ -1,4 +1,4 @@
-"""The run's journal, its backup, and a watch over its files."""
+"""The run's journal, a copy of its database, and a watch over its files."""
 
 __all__ = [
     "journal",

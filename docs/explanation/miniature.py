@@ -3,7 +3,7 @@
     python docs/explanation/miniature.py coordinator    # with `status` in its place: what each candidate waits for
     python docs/explanation/miniature.py worker         # in other terminals, as many as you like; kill any of them
 
-Read `Job` first, then `Coordinator`, `Fleet` and `work`. R1 to R20 are rules of docs/reference/protocol.md. The same
+Read `Job` first, then `Coordinator`, `Fleet` and `work`. R1 to R33 are rules of docs/reference/protocol.md. The same
 seed gives a mean of the same bits, whatever is killed: a new coordinator goes on from miniature.sqlite in its folder.
 """
 

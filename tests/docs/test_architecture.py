@@ -6,7 +6,7 @@ import re
 from deploy.structure import ROOT, SIDES, sources
 
 PAGE = ROOT / "docs" / "explanation" / "architecture.md"
-MOST_WORDS = 1200
+MOST_WORDS = 1300
 NO_ROOM = {"__pycache__", "pretrained"}  # `pretrained` holds files that ship, and no code
 
 
