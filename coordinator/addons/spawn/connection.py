@@ -125,6 +125,9 @@ class Connection:
     def close(self) -> None:
         """Close the connection, which ends workers that use its tunnel. From any thread."""
         self._child.end(PATIENCE)
+        if self._child.popen.stdin is not None:
+            with suppress(OSError):  # what was not read is lost with it
+                self._child.popen.stdin.close()
 
     def _send(self, *data: bytes) -> None:
         assert self._child.popen.stdin is not None
