@@ -15,7 +15,7 @@ from dreamfleet.common.protocol.messages import MAX_MESSAGE, ControlReply, Hello
 from dreamfleet.common.transport.session import Network, open_session
 from tests.support import tasks
 from tests.support.mutations import mutations
-from tests.support.processes import DEADLINE
+from tests.support.processes import DEADLINE, until
 from tests.support.samples import JSON, MSGPACK
 
 BLOCK = zenoh.CongestionControl.BLOCK  # else a busy host loses some
@@ -42,11 +42,21 @@ def test_a_coordinator_drops_and_counts_what_is_malformed_or_foreign(processes, 
         replies = list(session.get(keys.hello("test"), payload=b"let me in", timeout=DEADLINE))
         assert b'"accepted": false' in replies[0].ok.payload.to_bytes()
         assert not list(session.get(keys.bundle("test", "ab" * 32), timeout=1))
-    while sum((dropped := processes.status()["dropped"]).values()) < 16:
-        pass
-    assert dropped == {"not msgpack": 6, "oversize": 3, "foreign run": 3, "schema": 3, "not JSON": 1}
+    until(lambda: count_dropped(processes) >= 16)
+    counted = {
+        "not msgpack": 6,
+        "oversize": 3,
+        "foreign run": 3,
+        "schema": 3,
+        "not JSON": 1,
+    }
+    assert processes.status()["dropped"] == counted
     processes.worker("--task", tasks.SLOW_TOY)
     assert coordinator.finish()[0] == 0
+
+
+def count_dropped(processes):
+    return sum(processes.status()["dropped"].values())
 
 
 def flood(processes, coordinator, *counts):
@@ -58,9 +68,8 @@ def flood(processes, coordinator, *counts):
                 key = KEYS[kinds[number % 3]]("test", "stranger/0badc0de")
                 session.put(key, payload, congestion_control=BLOCK)
             sent += count
-            while sum((dropped := processes.status()["dropped"]).values()) < sent:
-                pass
-            after.append((sum(dropped.values()), resident(coordinator)))
+            until(lambda sent=sent: count_dropped(processes) >= sent)
+            after.append((count_dropped(processes), resident(coordinator)))
     coordinator.wait_for_event("generation", times=2)
     return after
 
