@@ -14,7 +14,7 @@ NotNegative = Annotated[float, Meta(ge=0.0, le=sys.float_info.max)]
 
 
 def check_bounds(config: Any, *, are_flags: bool = True) -> None:
-    """`UsageError` for a number outside the bounds in its field's annotation; `None` is within any.
+    """`UsageError` for a number or a text's length outside the bounds in its field's annotation; `None` is within any.
 
     It names the flag, or the key where the fields are not flags.
     """
@@ -22,7 +22,10 @@ def check_bounds(config: Any, *, are_flags: bool = True) -> None:
         value = getattr(config, name)
         for kind in (hint, *get_args(hint)):  # the second finds the parts of `Annotated[...] | None`
             for bounds in getattr(kind, "__metadata__", ()):
-                if value is not None and not bounds.ge <= value <= bounds.le:
+                named = f"--{name.replace('_', '-')}" if are_flags else name
+                if isinstance(value, str):
+                    if bounds.max_length is not None and len(value) > bounds.max_length:
+                        raise UsageError(f"{named} has at most {bounds.max_length} characters, not {len(value)}")
+                elif value is not None and not bounds.ge <= value <= bounds.le:
                     low, high = (f"{each:g}" if isinstance(each, float) else each for each in (bounds.ge, bounds.le))
-                    named = f"--{name.replace('_', '-')}" if are_flags else name
                     raise UsageError(f"{named} must be from {low} to {high}, not {value}")

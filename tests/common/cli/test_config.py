@@ -2,10 +2,12 @@ import re
 from argparse import ArgumentParser, Namespace
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import pytest
+from msgspec import Meta
 
+from dreamfleet.common.cli.bounds import check_bounds
 from dreamfleet.common.cli.config import add_flags, load, option, read_toml
 from dreamfleet.common.errors import UsageError
 
@@ -99,3 +101,16 @@ def test_an_empty_variable_of_a_number_or_a_choice_is_as_none():
     empty = {f"DREAMFLEET_THING_{name}": "" for name in ("COUNT", "RATE", "COLOUR", "LOUD", "LIMIT", "NAMES")}
     file = {"thing": {"count": 5, "colour": "blue", "names": ["f"]}}
     assert load(ThingConfig, "thing", file=file, environment=empty) == ThingConfig(5, colour="blue", names=())
+
+
+@dataclass(frozen=True)
+class Bounded:
+    share: Annotated[float, Meta(ge=0.0, le=1.0)] | None = None
+    note: Annotated[str, Meta(max_length=3)] = ""
+
+
+@pytest.mark.parametrize("given", [{"share": 1.5}, {"share": float("nan")}, {"note": "long"}])
+def test_a_number_and_a_texts_length_have_the_bounds_of_their_annotation(given):
+    check_bounds(Bounded(0.5, "few"))
+    with pytest.raises(UsageError, match=f"--{next(iter(given))}"):
+        check_bounds(Bounded(**given))
