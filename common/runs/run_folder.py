@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import replace
 from difflib import SequenceMatcher
 from pathlib import Path
 from typing import Self
@@ -287,14 +285,6 @@ class RunFolder:
             )
             for number, mean, std, best, worst, sigma, steps, seconds, failed in rows
         ]  # fmt: skip
-
-    def scored_history(self, since: int = 0) -> list[StoredGeneration]:
-        """As `history`, with NaN for the fitness of generations in which no candidate has one."""
-        nan, unscored = math.nan, self.unscored_generations()
-        return [
-            replace(each, mean=nan, std=nan, best=nan, worst=nan) if each.number in unscored else each
-            for each in self.history(since)
-        ]
 
     def unscored_generations(self) -> set[int]:
         """The closed generations without a mean fitness, which `history` gives as 0."""

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
+from dreamfleet.common.addons.analysis.scored_history import scored_history
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.function_values import is_minimised, spans_decades, value_of
 from dreamfleet.common.protocol.tasks import DREAM, is_function_task
@@ -53,7 +54,7 @@ def draw_fitness(panels: Sequence[Any], run: RunFolder) -> list[Any]:
     legend.
     """
     task, evaluations, stages = run.spec, run.evaluations(), _stages(run)
-    history = [in_values(each, task) for each in run.scored_history()]
+    history = [in_values(each, task) for each in scored_history(run)]
     number, mean, std, best, worst = np.array(
         [(each.number, each.mean, each.std, each.best, each.worst) for each in history]
     ).T

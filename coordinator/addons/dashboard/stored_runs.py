@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dreamfleet.common.addons.analysis.elites import RunArchive
+from dreamfleet.common.addons.analysis.scored_history import scored_history
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.client.elites import Elite
 from dreamfleet.common.client.run_view import RunView
@@ -48,7 +49,7 @@ def list_runs(runs_dir: Path) -> list[dict[str, Any]]:
 def describe_run(runs_dir: Path, name: str) -> dict[str, Any]:
     """All details of one run; `JournalError` or `UsageError` if there is none or it is unreadable."""
     with open_run(runs_dir, name) as run, run.read_transaction():
-        settings, history = run.settings, run.scored_history()
+        settings, history = run.settings, scored_history(run)
         if [each.number for each in history] != list(range(len(history))):
             raise JournalError(f"the journal of run {name} is damaged: generations are missing; restore it from a copy")
         data = RunData(settings, history, run.evaluations(), run.confirmation(), run.episode_limit)

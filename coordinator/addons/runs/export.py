@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from dreamfleet.common.addons.analysis.elites import RunArchive, tables
+from dreamfleet.common.addons.analysis.scored_history import scored_history
 from dreamfleet.common.errors import MissingExtraError, UsageError
 from dreamfleet.common.files.atomic_write import open_output, reporting_write_errors
 from dreamfleet.common.files.regular_files import is_file, is_folder
@@ -28,7 +29,7 @@ from dreamfleet.common.runs.run_folder import RunFolder
 
 Row = dict[str, Any]
 TABLES: dict[str, tuple[type[Any], Callable[[RunFolder], Sequence[Any]]]] = {
-    "generations": (StoredGeneration, RunFolder.scored_history),
+    "generations": (StoredGeneration, scored_history),
     "candidates": (StoredCandidate, RunFolder.candidates),
     "evaluations": (StoredEvaluation, RunFolder.evaluations),
     "confirmation": (StoredConfirmation, lambda run: [each] if (each := run.confirmation()) else []),
@@ -88,7 +89,7 @@ def scalars_of(run: RunFolder, since: int = 0) -> Iterator[tuple[int, dict[str, 
 
     `__` in a name stands for the `/` that groups curves.
     """
-    for each in run.scored_history(since):
+    for each in scored_history(run, since):
         numbers = {
             "fitness__mean": each.mean, "fitness__std": each.std, "fitness__best": each.best,
             "fitness__worst": each.worst, "search__sigma": each.sigma, "effort__steps": each.steps,

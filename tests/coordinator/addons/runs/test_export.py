@@ -1,4 +1,5 @@
-"""A run's journal as CSV, Parquet and TensorBoard's events, read back by those who read such files."""
+"""A run's journal as CSV, Parquet and TensorBoard's events, read back by those who read such files.
+Tests common/addons/analysis/scored_history.py."""
 
 import csv
 import json

@@ -218,7 +218,7 @@ def test_what_is_read_is_what_box2d_says():
     seen = array("d", bytes(8 * 20))
     car.find_native().look(seen, environment.car)
     bodies = (*environment.car.wheels, environment.car.hull)
-    told = [(*body.position, body.angle, getattr(body, "phase", 0.0)) for body in bodies]
-    assert np.array_equal(np.reshape(seen, (5, 4)), told)
+    true = [(*body.position, body.angle, getattr(body, "phase", 0.0)) for body in bodies]
+    assert np.array_equal(np.reshape(seen, (5, 4)), true)
     with pytest.raises(AttributeError, match="this"):
         car.find_native().touch(object(), object(), True)
