@@ -62,13 +62,15 @@ def draw_fitness(panels: Sequence[Any], run: RunFolder) -> list[Any]:
         [*best, *worst, *(value_of(each.mean, task) for each in evaluations)]
     )
     axes, scores = panels[0], panels[-1]
-    marker = "o" if len(history) == 1 else ""
     smooth = running_median(mean, [each.since for each in stages])
     thin = {} if smooth is None else {"linewidth": 0.8, "alpha": 0.6}
     jumps = [each.since for each in stages if each.stage.restart or each.origin is not None]
     smoothed = mean if smooth is None else smooth
     number, mean, std, best, worst, smoothed = _break_lines(jumps, number, mean, std, best, worst, smoothed)
-    axes.plot(number, mean, color="tab:blue", marker=marker, label="average of the candidates", **thin)
+    known = np.pad(~np.isnan(mean), 1)
+    lone = np.flatnonzero(known[1:-1] & ~known[:-2] & ~known[2:]).tolist()  # no line leads to or from them
+    dots = {"marker": "o", "markevery": lone} if lone else {}
+    axes.plot(number, mean, color="tab:blue", label="average of the candidates", **thin, **dots)
     if smooth is not None:
         label = f"its running median over {WINDOW} generations"
         axes.plot(number, smoothed, color="tab:blue", linewidth=2.2, label=label)
@@ -76,7 +78,7 @@ def draw_fitness(panels: Sequence[Any], run: RunFolder) -> list[Any]:
     ends = np.minimum(best, worst), np.maximum(best, worst)
     low, high = np.fmax(mean - std, ends[0]), np.fmin(mean + std, ends[1])
     axes.fill_between(number, low, high, alpha=0.2, color="tab:blue", linewidth=0, label=spread)
-    axes.plot(number, best, color="tab:orange", linewidth=1, marker=marker, label="best candidate")
+    axes.plot(number, best, color="tab:orange", linewidth=1, label="best candidate", **dots)
     for panel in panels:
         for count, each in enumerate(stages[1:]):
             named = {} if count or panel is not axes else {"label": "a stage begins"}

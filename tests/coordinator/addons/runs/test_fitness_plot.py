@@ -94,3 +94,10 @@ def test_a_line_has_a_gap_where_the_search_goes_on_elsewhere(runs):
         if len(line.get_xdata()) > 2:
             found = np.array(line.get_xdata(), dtype=float)
             assert [found[place + 1] for place in np.flatnonzero(np.isnan(found))] in ([4, 8], [5, 9])
+
+
+def test_a_generation_between_two_without_a_fitness_is_a_dot(runs, monkeypatch):
+    monkeypatch.setattr(RunFolder, "unscored_generations", lambda _: {1})
+    with RunFolder(runs / "reality") as run:
+        line = fitness_figure(run).axes[0].lines[0]
+    assert (line.get_marker(), line.get_markevery()) == ("o", [0, 2])
