@@ -84,7 +84,7 @@ UNITS = {
     "worker.drain_timeout": "seconds", "worker.lifetime": "seconds", "worker.slot_memory": "MiB",
     "worker.coordinator_timeout": "seconds",
 }  # fmt: skip
-RUN_ARGUMENTS = Path(__file__).parents[1] / "dreamfleet" / "experiments" / "run_arguments.py"
+RUN_ARGUMENTS = Path(__file__).parents[1] / "dreamfleet" / "experiments" / "local" / "run_arguments.py"
 RUN_ARGUMENTS_HEAD = '''"""Settings of `start_run` and `evolve`. Written by `make reference`: change the flags."""
 
 from __future__ import annotations

@@ -44,8 +44,8 @@ from dreamfleet.common.worlds.score_words import profile_of
 from dreamfleet.common.worlds.shipped import WORLDS
 from dreamfleet.coordinator.addons.status.status_panel import RunPanel
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE
-from dreamfleet.experiments import command_lines
-from dreamfleet.experiments.local_run import START_SECONDS, LocalRun, has_begun
+from dreamfleet.experiments.local import command_lines
+from dreamfleet.experiments.local.local_run import START_SECONDS, LocalRun, has_begun
 
 REFRESH = 0.5
 LOG_INTERVAL = 30.0  # seconds between two lines where no panel can be drawn, such as in a log

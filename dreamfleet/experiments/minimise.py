@@ -21,9 +21,9 @@ from dreamfleet.common.protocol.stop_kind import StopKind, StopReason
 from dreamfleet.common.runs.records import StoredGeneration, best_evaluation
 from dreamfleet.common.runs.run_paths import default_runs_dir
 from dreamfleet.common.schema.display import Displayed
-from dreamfleet.experiments.function_names import name_function
-from dreamfleet.experiments.local_run import has_begun
-from dreamfleet.experiments.search_arguments import candidate_calls, check_names, read_objective, read_seed
+from dreamfleet.experiments.local.function_names import name_function
+from dreamfleet.experiments.local.local_run import has_begun
+from dreamfleet.experiments.local.search_arguments import candidate_calls, check_names, read_objective, read_seed
 from dreamfleet.experiments.started_run import RunPausedError, StartedRun, start_run_in
 
 Floats = NDArray[np.float64]

@@ -35,10 +35,10 @@ from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import default_runs_dir
 from dreamfleet.coordinator.addons.runs.stored_run import StoredRun
 from dreamfleet.coordinator.settings import run_setup
-from dreamfleet.experiments import command_lines
-from dreamfleet.experiments.function_names import environment_for
-from dreamfleet.experiments.local_run import ALONE, POLL_INTERVAL, LocalFleet, LocalRun, has_begun, task_flags
-from dreamfleet.experiments.run_arguments import RunArguments
+from dreamfleet.experiments.local import command_lines
+from dreamfleet.experiments.local.function_names import environment_for
+from dreamfleet.experiments.local.local_run import ALONE, POLL_INTERVAL, LocalFleet, LocalRun, has_begun, task_flags
+from dreamfleet.experiments.local.run_arguments import RunArguments
 
 MOST_WORKERS = 1024  # processes of one slot
 STARTING = "starting.lock"  # held while a program starts and serves a run

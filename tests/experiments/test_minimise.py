@@ -1,4 +1,4 @@
-"""Searching a function's minimum on processes of this host. Tests search_arguments.py."""
+"""Searching a function's minimum on processes of this host. Tests dreamfleet/experiments/local/search_arguments.py."""
 
 import re
 
@@ -10,7 +10,7 @@ from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.experiments import minimise as module
-from dreamfleet.experiments.search_arguments import read_bounds, read_objective
+from dreamfleet.experiments.local.search_arguments import read_bounds, read_objective
 from tests.support import lying_tasks, objectives
 from tests.support.lying_tasks import LIES
 from tests.support.processes import free_port, until

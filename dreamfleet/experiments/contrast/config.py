@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from dreamfleet.common.cli.key_values import split_flags
 from dreamfleet.common.cli.presets import default_run_preset
 from dreamfleet.common.errors import UsageError
-from dreamfleet.experiments.command_lines import Words
 from dreamfleet.experiments.iteration.config import RESERVED_FLAGS
+from dreamfleet.experiments.local.command_lines import Words
 
 # Equal parameters: 422,625 and 421,277 of 32 latents and three actions.
 KINDS = (("plain", ""), ("attentive", "--set window=8 hidden=236"))

@@ -15,12 +15,12 @@ from dreamfleet.common.host.stop_signals import Stop
 from dreamfleet.common.runs.records import best_evaluation
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.schema.validation import from_plain, to_plain
-from dreamfleet.experiments.command_lines import options
 from dreamfleet.experiments.contrast.config import Contrast, Trial
 from dreamfleet.experiments.contrast.summary import TrialResult
-from dreamfleet.experiments.isolated import run_isolated
-from dreamfleet.experiments.kept_document import read_document, write_document
-from dreamfleet.experiments.local_run import LocalFleet, coordinator_words, evolve, has_ended, task_flags
+from dreamfleet.experiments.local.command_lines import options
+from dreamfleet.experiments.local.isolated import run_isolated
+from dreamfleet.experiments.local.kept_document import read_document, write_document
+from dreamfleet.experiments.local.local_run import LocalFleet, coordinator_words, evolve, has_ended, task_flags
 from dreamfleet.experiments.pipeline import read_training
 from dreamfleet.worker.training.stages.bundle import BundleRequest, build_bundle
 from dreamfleet.worker.training.stages.train import TrainRequest, summarise, train_model

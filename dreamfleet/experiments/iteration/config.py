@@ -10,7 +10,7 @@ from dreamfleet.common.cli.config import option
 from dreamfleet.common.cli.key_values import split_flags
 from dreamfleet.common.cli.presets import NAMES, check_preset, default_training_preset
 from dreamfleet.common.errors import UsageError
-from dreamfleet.experiments.command_lines import Words
+from dreamfleet.experiments.local.command_lines import Words
 
 # They change no round that is finished, nor what it means; what `--run-flags` lead to is compared instead of them.
 CHANGEABLE = frozenset({"rounds", "local", "jobs", "device", "run_flags"})

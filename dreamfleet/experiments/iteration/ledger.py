@@ -12,7 +12,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.schema.validation import from_plain
 from dreamfleet.experiments.iteration.config import CHANGEABLE, IterateConfig
 from dreamfleet.experiments.iteration.plan import ALL, BUNDLE, DATA, EVOLVE, GATE, INIT, Phase
-from dreamfleet.experiments.kept_document import read_document, write_document
+from dreamfleet.experiments.local.kept_document import read_document, write_document
 
 FORMAT = 1
 FIGURES: dict[str, dict[str, Any]] = {  # of a finished phase, which later phases and summaries read

@@ -23,14 +23,14 @@ from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.common.runs.records import StoredEvaluation, best_evaluation
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import BUNDLE as RUN_BUNDLE
-from dreamfleet.experiments.command_lines import Words
-from dreamfleet.experiments.isolated import run_isolated
 from dreamfleet.experiments.iteration import artefacts, gate, plan
 from dreamfleet.experiments.iteration.layout import ENCODED, EPISODES
 from dreamfleet.experiments.iteration.plan import MDNRNN, VAE, Phase
 from dreamfleet.experiments.iteration.requests import Requests
-from dreamfleet.experiments.kept_document import write_document
-from dreamfleet.experiments.local_run import LocalFleet, coordinator_words, evolve, has_ended
+from dreamfleet.experiments.local.command_lines import Words
+from dreamfleet.experiments.local.isolated import run_isolated
+from dreamfleet.experiments.local.kept_document import write_document
+from dreamfleet.experiments.local.local_run import LocalFleet, coordinator_words, evolve, has_ended
 from dreamfleet.worker.addons.bundles.extract import ExtractRequest, extract_models
 from dreamfleet.worker.addons.inspection.measure import measure
 from dreamfleet.worker.addons.refit.refit_stage import refit_controller

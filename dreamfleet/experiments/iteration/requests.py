@@ -10,11 +10,11 @@ from pathlib import Path
 from dreamfleet.common.cli.world_flags import OPTIONS, world_arguments
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.runs.seeds import VALIDATION
-from dreamfleet.experiments.command_lines import Words, options
 from dreamfleet.experiments.iteration.config import IterateConfig
 from dreamfleet.experiments.iteration.layout import IterationFolder
 from dreamfleet.experiments.iteration.ledger import IterationLedger
 from dreamfleet.experiments.iteration.plan import EVOLVE, GATE, MDNRNN, VAE, Phase
+from dreamfleet.experiments.local.command_lines import Words, options
 from dreamfleet.experiments.pipeline import read_bundle, read_training
 from dreamfleet.worker.addons.inspection.measure import FigureName, MeasureRequest
 from dreamfleet.worker.addons.refit.refit_stage import RefitRequest

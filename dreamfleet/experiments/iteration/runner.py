@@ -9,8 +9,6 @@ from datetime import UTC, datetime
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.host.stop_signals import Stop
-from dreamfleet.experiments.command_lines import Words
-from dreamfleet.experiments.isolated import run_isolated
 from dreamfleet.experiments.iteration import artefacts
 from dreamfleet.experiments.iteration.config import IterateConfig
 from dreamfleet.experiments.iteration.layout import IterationFolder
@@ -18,7 +16,9 @@ from dreamfleet.experiments.iteration.ledger import FinishedPhase, IterationLedg
 from dreamfleet.experiments.iteration.phases import PhaseRunner
 from dreamfleet.experiments.iteration.plan import Phase, PhasePlan
 from dreamfleet.experiments.iteration.requests import Requests
-from dreamfleet.experiments.local_run import LocalFleet
+from dreamfleet.experiments.local.command_lines import Words
+from dreamfleet.experiments.local.isolated import run_isolated
+from dreamfleet.experiments.local.local_run import LocalFleet
 from dreamfleet.worker.training.stages.train import MODELS, summarise
 
 

@@ -11,8 +11,8 @@ from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.schema.validation import OPTIONAL, from_plain, to_plain
-from dreamfleet.experiments.kept_document import read_document, write_document
-from dreamfleet.experiments.local_run import has_begun
+from dreamfleet.experiments.local.kept_document import read_document, write_document
+from dreamfleet.experiments.local.local_run import has_begun
 from dreamfleet.experiments.sweep.plan import Sweep, SweepOptions
 
 SUFFIX = ".sweep"

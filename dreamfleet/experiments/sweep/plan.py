@@ -14,7 +14,7 @@ from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.keys import check_run_name
-from dreamfleet.experiments.command_lines import Words
+from dreamfleet.experiments.local.command_lines import Words
 
 MOST_RUNS = 1000  # of one sweep
 _RANGE = re.compile(r"(-?\d+)\.\.(-?\d+)")

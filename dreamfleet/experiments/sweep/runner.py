@@ -21,9 +21,9 @@ from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.addons.environment_check import CHECKED
-from dreamfleet.experiments import local_run
-from dreamfleet.experiments.command_lines import Words, command
-from dreamfleet.experiments.local_run import POLL_INTERVAL, has_begun, has_ended, task_flags
+from dreamfleet.experiments.local import local_run
+from dreamfleet.experiments.local.command_lines import Words, command
+from dreamfleet.experiments.local.local_run import POLL_INTERVAL, has_begun, has_ended, task_flags
 from dreamfleet.experiments.sweep.folder import StoredSweep, SweepFolder
 from dreamfleet.experiments.sweep.plan import SweepRun, staggered_share
 

@@ -13,7 +13,7 @@ from dreamfleet.common.protocol.function_values import fitness_word, is_minimise
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
-from dreamfleet.experiments.local_run import has_begun
+from dreamfleet.experiments.local.local_run import has_begun
 from dreamfleet.experiments.sweep.plan import SweepRun
 
 # What a run may be judged by, the strongest first. A best evaluation is none of them: the best of many is partly luck.

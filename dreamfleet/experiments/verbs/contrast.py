@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     """Run all trials that are left, and compare them."""
     from dreamfleet.common.files.locks import folder_lock
     from dreamfleet.experiments.contrast.trials import LOCK, Trials
-    from dreamfleet.experiments.local_run import LocalFleet, parse_run_flags
+    from dreamfleet.experiments.local.local_run import LocalFleet, parse_run_flags
 
     kinds = tuple((name, flags) for name, flags in args.kind) or KINDS
     contrast = Contrast(kinds, tuple(args.seeds), args.mdnrnn_flags, args.run_flags)

@@ -78,7 +78,7 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
     from dreamfleet.experiments.iteration.phases import find_init
     from dreamfleet.experiments.iteration.plan import INIT, Phase
     from dreamfleet.experiments.iteration.runner import Iteration
-    from dreamfleet.experiments.local_run import LocalFleet, parse_run_flags, task_flags
+    from dreamfleet.experiments.local.local_run import LocalFleet, parse_run_flags, task_flags
 
     begun = IterationLedger.load(layout.ledger)
     config = load(IterateConfig, "iterate", base=begun.settings if begun else None, **args.sources)

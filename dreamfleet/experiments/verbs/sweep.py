@@ -129,7 +129,7 @@ def check_runs(sweep: Sweep, sources: Mapping[str, Any]) -> tuple[str, ...]:
     """
     from dreamfleet.common.cli.command_line import build_parser
     from dreamfleet.coordinator.settings import run_setup
-    from dreamfleet.experiments.local_run import load_parsed_flags
+    from dreamfleet.experiments.local.local_run import load_parsed_flags
 
     given = {*sweep.vary, *(flag.removeprefix("--").partition("=")[0] for flag in sweep.flags if flag[:2] == "--")}
     if taken := sorted(given & set(OWN)):
@@ -179,7 +179,7 @@ def _refuse_settings(args: argparse.Namespace, file: Mapping[str, Any]) -> None:
 def _fleet(args: argparse.Namespace, options: SweepOptions) -> SweepFleet:
     from dreamfleet.common.host.resource_limits import usable_cores
     from dreamfleet.common.transport.network import Network
-    from dreamfleet.experiments.local_run import free_port
+    from dreamfleet.experiments.local.local_run import free_port
     from dreamfleet.experiments.sweep.runner import SweepFleet
 
     if options.connect:

@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     """Serve the run for as many generations; exit 1 if it then reports another controller."""
     from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
     from dreamfleet.coordinator.verbs.coordinator import ExitReport, build_request, serve_request
-    from dreamfleet.experiments.local_run import task_flags
+    from dreamfleet.experiments.local.local_run import task_flags
     from dreamfleet.experiments.rerun import Rerun
 
     controller, beside = find_controller(args.controller, args.runs_dir)

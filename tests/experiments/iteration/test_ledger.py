@@ -1,4 +1,4 @@
-"""What is finished, as the folder keeps it. Tests dreamfleet/experiments/kept_document.py."""
+"""What is finished, as the folder keeps it. Tests dreamfleet/experiments/local/kept_document.py."""
 
 import json
 from dataclasses import replace

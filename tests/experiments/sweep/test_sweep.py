@@ -11,7 +11,7 @@ import pytest
 from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.cli.global_config import complete_arguments
 from dreamfleet.common.errors import DreamfleetError, UsageError
-from dreamfleet.experiments.local_run import task_flags
+from dreamfleet.experiments.local.local_run import task_flags
 from dreamfleet.experiments.sweep import summary
 from dreamfleet.experiments.sweep.figure import sweep_figure
 from dreamfleet.experiments.sweep.folder import SETTINGS, StoredSweep, SweepFolder

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import pytest
 
 from dreamfleet.common.errors import DreamfleetError, RefusedError, StoppedError, UsageError
-from dreamfleet.experiments import isolated
-from dreamfleet.experiments.isolated import run_isolated
+from dreamfleet.experiments.local import isolated
+from dreamfleet.experiments.local.isolated import run_isolated
 
 
 @dataclass(frozen=True)

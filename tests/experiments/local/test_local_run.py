@@ -6,7 +6,7 @@ from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.common.runs.records import StoredEvaluation
 from dreamfleet.experiments.iteration.phases import other_means
-from dreamfleet.experiments.local_run import LocalFleet, LocalRun
+from dreamfleet.experiments.local.local_run import LocalFleet, LocalRun
 from tests.support.processes import DEADLINE, free_port
 
 

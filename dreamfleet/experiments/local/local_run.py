@@ -24,8 +24,8 @@ from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.common.transport.network import Network, wait_for_listener
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.limits import LimitsConfig
-from dreamfleet.experiments import command_lines
-from dreamfleet.experiments.command_lines import Words
+from dreamfleet.experiments.local import command_lines
+from dreamfleet.experiments.local.command_lines import Words
 
 # Variables of a process that stays on this host, even if its user is in a fleet.
 ALONE = {"DREAMFLEET_JOIN": "", "DREAMFLEET_CONNECT": ""}

@@ -11,7 +11,7 @@ import pytest
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.trusted_modules import PLACES
-from dreamfleet.experiments.function_names import IMPORTED_FOR, environment_for, name_function
+from dreamfleet.experiments.local.function_names import IMPORTED_FOR, environment_for, name_function
 from tests.support import objectives
 from tests.support.processes import ROOT
 
@@ -52,7 +52,7 @@ def test_a_module_that_searches_as_it_is_imported_is_refused(monkeypatch):
 
 SCRIPT = """
 import functools
-from dreamfleet.experiments.function_names import name_function
+from dreamfleet.experiments.local.function_names import name_function
 def cost(x, weight=1): return 0.0
 heavy = functools.partial(cost, weight=9)
 print(name_function(cost).task, name_function(heavy).task)
