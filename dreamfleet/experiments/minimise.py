@@ -109,11 +109,11 @@ def minimise(
     The search ends by `ftarget`, before it has more than `maxfevals` calls, as it converges, when `callback(progress)`
     returns `False` or raises `StopIteration`, or by a limit in `settings`, as a generation closes. Generations that
     close while the callback runs count too. `maxfevals` counts the calls for means too, and those by which a noisy
-    search confirms its best ones at the end. Only a first generation may exceed it. The search begins anew up to
-    `restarts` times from a random point within bounds, else from `x0`: with twice the population (`ipop`), or with
-    large and small ones in turn (`bipop`). `settings` are those of `start_run`, such as `generations`, `optimiser`,
-    `episodes`, `seed` or `listen`; with `workers=0` only other hosts score. `UsageError` for a wrong setting, for a
-    function that fails at `x0`, or if all candidates fail before one has a value.
+    search confirms its best ones at the end. Only the first generation of all may exceed it. The search begins anew up
+    to `restarts` times, while a whole generation fits in, from a random point within bounds, else from `x0`: with twice
+    the population (`ipop`), or with large and small ones in turn (`bipop`). `settings` are those of `start_run`, such
+    as `generations`, `optimiser`, `episodes`, `seed` or `listen`; with `workers=0` only other hosts score. `UsageError`
+    for a wrong setting, for a function that fails at `x0`, or if all candidates fail before one has a value.
 
     >>> import dreamfleet, numpy as np
     >>> found = dreamfleet.minimise(np.linalg.norm, x0=[3, 4], sigma0=1, ftarget=0.01, workers=1)
@@ -218,9 +218,11 @@ class _Searches:
         if self._settings.get("optimiser", "cma") == "cma" and size <= FULL_DIMENSION:
             self._settings.setdefault("covariance", "full")
         for number, plan in enumerate(self._plans(first, seed, restarts, kind)):
+            if number and self._budget and not candidate_calls(self._left, self._settings_of(plan)):
+                break
             own = f"{self._runs[0]}-restart-{number}" if number else name
             reason = self._run(own, plan, number)
-            if self._stopped or self._has_reached or (self._budget and self._spent >= self._budget):
+            if self._stopped or self._has_reached:
                 break
         return self._result(reason)
 
@@ -243,7 +245,7 @@ class _Searches:
     @property
     def _left(self) -> int:
         """Calls that are left for the next search; 0: no limit."""
-        return max(self._budget - self._spent, 1) if self._budget else 0
+        return self._budget - self._spent if self._budget else 0
 
     @property
     def _spent(self) -> int:
@@ -257,17 +259,11 @@ class _Searches:
 
     def _run(self, name: str | None, plan: _Plan, number: int) -> StopReason:
         """One search as a run; why it ended."""
-        objective, settings = self._objective_of(plan, number), self._settings
-        target = None if self._ftarget is None else objective.value(self._ftarget)
-        patience = 50 + math.ceil(100 * objective.dimension / plan.popsize)
-        own: dict[str, Any] = {
-            "run": name, "task": self._function.task, "task_options": objective.options, "population": plan.popsize,
-            "sigma0": 1.0, "seed": plan.seed, "failure_limit": 1.0, **(NOISY if self._is_noisy else DETERMINISTIC),
-            **({"target": target} if self._is_noisy else {"candidate_target": target, "stagnation": patience}),
-        }  # fmt: skip
+        objective = self._objective_of(plan, number)
+        settings = {"run": name, "task_options": objective.options, **self._settings_of(plan)}
         if plan.calls:
-            own["steps"] = candidate_calls(plan.calls, {**own, **settings})
-        with start_run_in(self._function.environment, self._workers, self._runs_dir, {**own, **settings}) as run:
+            settings.setdefault("steps", candidate_calls(plan.calls, settings) or 1)
+        with start_run_in(self._function.environment, self._workers, self._runs_dir, settings) as run:
             self._runs.append(run.name)
             self._first = len(self._history)
             for text in () if number else run.warnings:
@@ -279,9 +275,20 @@ class _Searches:
         run.close()
         if self._has_reached:
             return StopReason(ended.kind, f"reached ftarget {format_number(self._ftarget)}")
-        if self._budget and ended.kind is StopKind.STEPS and "steps" not in settings:
+        if self._budget and ended.kind is StopKind.STEPS and "steps" not in self._settings:
             return StopReason(ended.kind, f"maxfevals={self._budget} is reached")
         return ended
+
+    def _settings_of(self, plan: _Plan) -> dict[str, Any]:
+        """The settings of a search's run that depend on no other search."""
+        target = None if self._ftarget is None else self._objective.value(self._ftarget)
+        patience = 50 + math.ceil(100 * self._objective.dimension / plan.popsize)
+        return {
+            "task": self._function.task, "population": plan.popsize, "sigma0": 1.0, "seed": plan.seed,
+            "failure_limit": 1.0, **(NOISY if self._is_noisy else DETERMINISTIC),
+            **({"target": target} if self._is_noisy else {"candidate_target": target, "stagnation": patience}),
+            **self._settings,
+        }  # fmt: skip
 
     def _follow_all(self, run: StartedRun, objective: Objective) -> StopReason:
         """Follow a run to its end; why it ended. `UsageError` if no candidate of the search has a value."""

@@ -117,8 +117,8 @@ def test_what_a_barred_host_brought_is_in_no_result(processes, tmp_path):
 
 
 @pytest.mark.slow
-def test_restarts_are_runs_of_larger_populations_and_share_the_budget(tmp_path):
-    given = {"bounds": (-2, 2), "maxfevals": 60, "restarts": 3, "generations": 2, **FEW}
+def test_restarts_are_runs_of_larger_populations_and_share_the_budget_while_a_generation_fits_in(tmp_path):
+    given = {"bounds": (-2, 2), "maxfevals": 90, "restarts": 3, "generations": 2, **FEW}
     found = dreamfleet.maximise(objectives.sphere, [0, 0], 1.0, run="mine", runs_dir=tmp_path, **given)
     assert found.runs == ("mine", "mine-restart-1", "mine-restart-2")
     sizes = []
@@ -126,6 +126,7 @@ def test_restarts_are_runs_of_larger_populations_and_share_the_budget(tmp_path):
         with dreamfleet.open_run(name, tmp_path) as run:
             sizes.append((run.settings.population, len(run.history())))
     assert sizes == [(8, 2), (16, 2), (32, 1)]
+    assert found.nfev <= 90
     assert found.fun == max(each.fun for each in found.history) > 2
 
 

@@ -75,12 +75,14 @@ def read_seed(value: Any) -> int:
 def candidate_calls(budget: int, settings: Mapping[str, Any]) -> int:
     """How many of `budget` calls candidates may have, so that with those for means the search has no more.
 
-    At least one generation's. Every so many generations and at the end a mean is evaluated; at last the best means are
-    confirmed.
+    0 if not even one generation fits in. Every so many generations and at the end a mean is evaluated; at last the best
+    means are confirmed.
 
     >>> means = {"evaluate_every": 10, "evaluation_episodes": 20, "confirm_episodes": 20}
     >>> candidate_calls(400, {"population": 6, "episodes": 2, **means}), candidate_calls(400, {"population": 8})
     (276, 400)
+    >>> candidate_calls(51, {"population": 6, "episodes": 2, **means}), candidate_calls(7, {"population": 8})
+    (0, 0)
     """
     names = ("population", "episodes", "evaluate_every", "evaluation_episodes", "confirm_episodes")
     try:
@@ -93,7 +95,7 @@ def candidate_calls(budget: int, settings: Mapping[str, Any]) -> int:
         means = -(-generations // every) if every > 0 else 0
         return generations * generation + means * evaluation + total_episodes(min(means, FINALISTS), confirmed)
 
-    return generation * max(bisect_right(range(1, budget // generation + 1), budget, key=calls), 1)
+    return generation * bisect_right(range(1, budget // generation + 1), budget, key=calls)
 
 
 def read_objective(x0: Any, sigma0: Any, bounds: Any, given: dict[str, Any]) -> Objective:
