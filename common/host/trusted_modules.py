@@ -11,12 +11,14 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.util import find_spec
+from inspect import isclass, isroutine
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from dreamfleet.common.errors import DreamfleetError, UsageError
-from dreamfleet.common.host.packages import allow_swig_types
-from dreamfleet.common.host.user_code import describe_error, user_code
+from dreamfleet.common.host.packages import allow_swig_types, find_distributions
+from dreamfleet.common.host.user_code import describe_error, is_ours, user_code
 
 VARIABLE = "DREAMFLEET_TRUST"
 PLACES = "DREAMFLEET_PATH"  # folders of users' modules, for this process and those that it starts
@@ -42,17 +44,23 @@ def trust_meanwhile() -> Iterator[None]:
 
 
 def is_trusted(module: str) -> bool:
-    """Whether a name from elsewhere may choose this module: the user trusts it, or this program has it already."""
-    if module in sys.modules:
+    """Whether a name from elsewhere may choose this module: the user trusts it, or the user's program imported it.
+
+    That a module is loaded says nothing of Python's own, of installed packages, or in a command of ours: `pickle.loads`
+    runs what the numbers of a controller's file say.
+    """
+    if any(module == each or module.startswith(f"{each}.") for each in _trusted_modules()):
         return True
-    return any(module == each or module.startswith(f"{each}.") for each in _trusted_modules())
+    foreign = _is_pythons(module) or module.partition(".")[0] == "dreamfleet" or is_ours()
+    return module in sys.modules and not foreign and not find_distributions(module)
 
 
 def check_trusted(module: str, chooser: str) -> None:
     """`UsageError` unless the module is trusted; `chooser` says what names it, such as `task 'mine:Task'`."""
     if not is_trusted(module):
+        harm = "by which a file can do harm, and " * _is_pythons(module)
         raise UsageError(
-            f"{chooser} is code in the module {module!r}, which is not trusted here: if you trust that module, pass "
+            f"{chooser} is code in the module {module!r}, {harm}which is not trusted here: if you trust it, pass "
             f"--trust {module}, or {VARIABLE}={module} in the environment{_place_hint(module)}"
         )
 
@@ -69,6 +77,22 @@ def import_trusted(module: str, chooser: str) -> ModuleType:
     except Exception as error:  # a module may raise anything
         raise UsageError(f"{chooser}: importing {module} raised {describe_error(error)}") from error
     trust([module])  # also in processes that this one starts, which may not have it yet
+    return found
+
+
+def find_attribute(module: ModuleType, name: str) -> Any:
+    """What a dotted name in a trusted module names; `AttributeError` if it leads out of what is trusted.
+
+    It leads out if it passes another module or Python's internal names, or if what it names is Python's own.
+    """
+    found: Any = module
+    for part in name.split("."):
+        found = getattr(found, part)
+        if part.startswith("__") or isinstance(found, ModuleType):
+            raise AttributeError(f"{part} of {module.__name__} is not code of that module")
+    owner = found.__module__ if isroutine(found) or isclass(found) else None
+    if owner and _is_pythons(owner) and not _is_pythons(module.__name__):
+        raise AttributeError(f"{name} of {module.__name__} is not code of that module, but of {owner}")
     return found
 
 
@@ -112,6 +136,10 @@ def check_module_name(module: str) -> None:
             f"the module {top!r} in {folder} is called like one of Python's own, which other processes would import "
             "instead: give it another name"
         )
+
+
+def _is_pythons(module: str) -> bool:
+    return module.partition(".")[0] in sys.stdlib_module_names
 
 
 def _extend_path() -> None:

@@ -35,13 +35,13 @@ _shows_own = False  # whether this process keeps what it shows to a user's code
 def own_arguments() -> dict[str, str]:
     """The variable by which processes that this program starts show its arguments to a user's code."""
     text = json.dumps([str(each) for each in sys.argv])
-    return {} if _is_ours() or len(text) > MOST_BYTES else {ARGUMENTS: text}
+    return {} if is_ours() or len(text) > MOST_BYTES else {ARGUMENTS: text}
 
 
 def keep_user_arguments() -> None:
     """Let a user's code see its arguments from now on: this process scores, and needs no command line any more."""
     global _shows_own  # noqa: PLW0603 - one a process
-    if _is_ours():
+    if is_ours():
         _shows_own = True
         sys.argv = _user_arguments("")
 
@@ -104,7 +104,7 @@ class _Copying:
 
 @contextmanager
 def _arguments_shown(name: str) -> Iterator[None]:
-    if not _is_ours():  # a user's own program, whose arguments they are
+    if not is_ours():  # a user's own program, whose arguments they are
         yield
         return
     with _swapping:
@@ -116,7 +116,7 @@ def _arguments_shown(name: str) -> Iterator[None]:
                 sys.argv = before
 
 
-def _is_ours() -> bool:
+def is_ours() -> bool:
     """Whether this process runs a command line of ours."""
     started = Path(sys.argv[0]) if sys.argv else Path()
     return _shows_own or started.name == "dreamfleet" or _PACKAGE in started.parents

@@ -18,7 +18,7 @@ from typing import Any
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.host.packages import GYMNASIUM, install_command_for, wrong_version
-from dreamfleet.common.host.trusted_modules import check_trusted, import_trusted
+from dreamfleet.common.host.trusted_modules import check_trusted, find_attribute, import_trusted
 from dreamfleet.common.host.user_code import user_code
 from dreamfleet.common.printable import suggest
 from dreamfleet.common.schema.display import DisplayedFields
@@ -98,14 +98,23 @@ def module_of(name: str) -> str:
     return head if colon and head not in registered_tasks() else ""
 
 
+def check_task_trusted(name: str) -> None:
+    """`UsageError` unless the module that a task's name chooses is trusted here.
+
+    A loaded module may choose among gymnasium's environments: these are registered, or classes of environments.
+    """
+    module = module_of(name)
+    if module and not (name.startswith(f"{GYM}:") and module in sys.modules):
+        check_trusted(module, f"task {name!r}")
+
+
 def load_task(name: str) -> Any:
     """Create the task of this name; `UsageError` if it is unknown or cannot be loaded."""
     points = registered_tasks()
     head, colon, rest = name.partition(":")
     try:
         if head in points:
-            if module := module_of(name):
-                check_trusted(module, f"task {name!r}")
+            check_task_trusted(name)
             make = points[head].load()
             return make(rest) if colon else make()
         if colon:
@@ -141,7 +150,7 @@ def _task_class(module: Any, name: str) -> Any:
     gymnasium, written = sys.modules.get("gymnasium"), f"{GYM}:{module.__name__}:{name}"
     if not hasattr(module, name) and (_ENVIRONMENT.search(name) or name in getattr(gymnasium, "registry", ())):
         raise AttributeError(f"{module.__name__} has no class {name}; write {written} if that is its environment")
-    found = getattr(module, name)
+    found = find_attribute(module, name)
     if not isinstance(found, type):
         raise TypeError(f"{name} of {module.__name__} is not a task: it is not a class")
     if issubclass(found, getattr(gymnasium, "Env", ())):

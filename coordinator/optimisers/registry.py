@@ -12,7 +12,7 @@ from typing import Any
 from dreamfleet.common.errors import MissingExtraError, UsageError
 from dreamfleet.common.host.packages import install_command_for
 from dreamfleet.common.host.resource_limits import usable_memory
-from dreamfleet.common.host.trusted_modules import import_trusted
+from dreamfleet.common.host.trusted_modules import find_attribute, import_trusted
 from dreamfleet.common.host.user_code import user_code
 from dreamfleet.common.printable import did_you_mean, plural
 from dreamfleet.coordinator.optimisers.api import Footprint, Optimiser, Search
@@ -82,7 +82,7 @@ def _find(name: str) -> Any:
             f"{', '.join(known) or 'none'}, and your own as module:attribute"
         )
     try:
-        return getattr(import_trusted(module, f"optimiser {name!r}"), attribute)
+        return find_attribute(import_trusted(module, f"optimiser {name!r}"), attribute)
     except (ImportError, AttributeError) as error:
         raise UsageError(f"optimiser {name!r} cannot be loaded: {error}") from error
 

@@ -23,12 +23,11 @@ from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
 from dreamfleet.common.files.locks import open_lock, try_lock
 from dreamfleet.common.host.reports import WARNING
 from dreamfleet.common.host.resource_limits import usable_cores
-from dreamfleet.common.host.trusted_modules import check_trusted
 from dreamfleet.common.host.user_code import own_arguments
 from dreamfleet.common.printable import suggest
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.protocol.stop_kind import PauseKind
-from dreamfleet.common.protocol.tasks import module_of
+from dreamfleet.common.protocol.tasks import check_task_trusted
 from dreamfleet.common.runs.own_runs import trust_own_run
 from dreamfleet.common.runs.records import StoredGeneration
 from dreamfleet.common.runs.run_folder import open_run
@@ -219,8 +218,7 @@ def _resumed_task(name: object, runs_dir: Path | str | None) -> str | None:
     with open_run(default_runs_dir() if runs_dir is None else Path(runs_dir), name) as run:
         uid, spec = run.uid, run.spec
     trust_own_run(uid, spec.task, spec.options)
-    if module := module_of(spec.task):
-        check_trusted(module, f"task {spec.task!r}")
+    check_task_trusted(spec.task)
     return spec.task
 
 

@@ -12,7 +12,7 @@ from dreamfleet.common.files.atomic_write import reporting_write_errors
 from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.files.tensorboard import EXTRA, open_event_file
 from dreamfleet.common.host.packages import check_modules
-from dreamfleet.common.host.trusted_modules import import_trusted
+from dreamfleet.common.host.trusted_modules import find_attribute, import_trusted
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.addons.sinks.event_files import read_scalars
 from dreamfleet.coordinator.settings.live_log import SinkName, parse_sink
@@ -63,7 +63,7 @@ def _find(name: SinkName) -> Callable[[str, RunFolder], Sink]:
         return TensorBoardSink
     try:
         module = import_trusted(name.module, f"log_to {name.kind!r}")
-        kind: Callable[[str, RunFolder], Sink] = getattr(module, name.kind.partition(":")[2])
+        kind: Callable[[str, RunFolder], Sink] = find_attribute(module, name.kind.partition(":")[2])
     except (ImportError, AttributeError) as error:
         raise UsageError(f"log_to {name.kind!r} cannot be loaded: {error}") from error
     return kind

@@ -14,11 +14,10 @@ from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.host.process_pool import count_step, map_in_processes
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.stall_watch import STALL_SECONDS
-from dreamfleet.common.host.trusted_modules import check_trusted
 from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_from_fingerprint
-from dreamfleet.common.protocol.tasks import module_of
+from dreamfleet.common.protocol.tasks import check_task_trusted
 from dreamfleet.common.runs.own_runs import trust_own_run
 from dreamfleet.common.runs.records import StoredFailure, StoredResult
 from dreamfleet.common.runs.run_folder import RunFolder
@@ -93,8 +92,7 @@ def replay(
     on seeds that were replaced.
     """
     trust_own_run(run.uid, run.spec.task, run.spec.options)
-    if module := module_of(run.spec.task):
-        check_trusted(module, f"task {run.spec.task!r}")
+    check_task_trusted(run.spec.task)
     with run.read_transaction():
         parameters = run.candidate(generation, candidate)
         stage, own = run.stage_at(generation).stage, run.spec

@@ -22,7 +22,7 @@ from dreamfleet.common.artifacts.objective import KEY, Objective, takes_seed
 from dreamfleet.common.artifacts.task_options import check_options
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host.packages import find_distributions
-from dreamfleet.common.host.trusted_modules import import_trusted
+from dreamfleet.common.host.trusted_modules import find_attribute, import_trusted
 from dreamfleet.common.host.user_code import describe_error
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.protocol.tasks import FUNCTION
@@ -160,14 +160,14 @@ def _find_function(place: str) -> Callable[..., Any]:
     module, colon, name = place.partition(":")
     if not (module and colon and name):
         raise UsageError(f"task {FUNCTION}:{place} names no function: write {FUNCTION}:MODULE:NAME")
-    found: Any = import_trusted(module, f"task '{FUNCTION}:{place}'")
-    for part in name.split("."):
-        if not hasattr(found, part):
-            raise UsageError(
-                f"task {FUNCTION}:{place}: {module} has no function {name} once it is imported: what stands under "
-                '`if __name__ == "__main__":` is not there'
-            )
-        found = getattr(found, part)
+    imported = import_trusted(module, f"task '{FUNCTION}:{place}'")
+    try:
+        found = find_attribute(imported, name)
+    except AttributeError as error:
+        raise UsageError(
+            f"task {FUNCTION}:{place}: {module} has no function {name} once it is imported ({error}): what stands "
+            'under `if __name__ == "__main__":` is not there'
+        ) from error
     if not callable(found):
         raise UsageError(f"task {FUNCTION}:{place}: {name} of {module} is no function but {type(found).__name__}")
     function: Callable[..., Any] = found
