@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
 from dreamfleet.common.protocol.messages import HelloRequest, Intervals, JobBatch
@@ -19,8 +19,7 @@ from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.run.worker_protocol import WorkerProtocol
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
-from dreamfleet.coordinator.storage.journal import Journal
-from tests.simulation.disk import Disk, MemoryJournal
+from tests.simulation.disk import Disk, SimulatedJournal
 from tests.simulation.schedule import Shape
 from tests.simulation.truth import Strategy, settings_of
 
@@ -56,9 +55,8 @@ class Coordinator:
     def __init__(self, disk: Disk, witness: Witness, shape: Shape, life: int, now: float) -> None:
         self.nonce = f"{life:016x}"
         limits = LimitsConfig(generations=shape.generations if shape.ends else 0)
-        journal = cast(Journal, MemoryJournal(disk, witness))
         network = NetworkConfig(beat=BEAT, verify=shape.verify, failure_limit=1.0)
-        self.run = Run(journal, settings_of(shape), limits, network, now, ANCHOR_KEY)
+        self.run = Run(SimulatedJournal(disk, witness), settings_of(shape), limits, network, now, ANCHOR_KEY)
         self.fleet = self.run.fleet
         self.worker_protocol = WorkerProtocol(self.run, "simulated", self.nonce, Intervals(BEAT, REPEAT))
         self.draining = False

@@ -212,7 +212,7 @@ def resume(_world: World, _fault: Fault, life: Coordinator) -> bool | None:
 @_kind
 def stranger(world: World, fault: Fault) -> None:
     """A result that nobody asked for: of no job, or another fitness of one that counts already."""
-    known = list(world.disk.tables["result"])
+    known = [digest for digest in world.disk.jobs if digest in world.disk.durable]
     unknown = bytes([int(fault.at * 100) % 256]) * 32
     digest = known[int(fault.at * 1000) % len(known)] if known and fault.amount > 1.0 else unknown
     worker = _worker(world, fault)

@@ -38,12 +38,14 @@ class LenientWitness(Witness):
 
     def finished(self, disk: Disk) -> None:
         """What counts is true, whoever lied."""
-        for job, result, *_ in disk.tables["result"].values():
-            super().counted(job, result)
-        for number, row in sorted(disk.tables["generation"].items()):
-            super().opened(number, row["vectors"])
-            if "closed" in row:
-                super().check_fitness(number, row["fitness"])
+        for digest, fitness in disk.read("SELECT digest, fitness FROM result"):
+            super().counted(disk.jobs[digest], fitness)
+        for number, closed in disk.read("SELECT number, closed FROM generation ORDER BY 1"):
+            query = "SELECT vector, fitness FROM candidate WHERE generation = ? ORDER BY number"
+            vectors, fitness = zip(*disk.read(query, number), strict=True)
+            super().opened(number, vectors)
+            if closed is not None:
+                super().check_fitness(number, list(fitness))
         super().finished(disk)
 
 
@@ -114,17 +116,14 @@ def play_with(
             if found.rule not in ("fitness", "content", "waste", "count"):
                 raise
             honest = found.rule == "waste"
-    tables = world.disk.tables
-    brought, forged = Counter[str](), Counter[str]()
-    for (_, worker), (because, (job, result, *_)) in tables["recalled"].items():
-        if because == "barred":
-            host = worker.partition("/")[0]
-            brought[host] += 1
-            forged[host] += result.fitness != fitness_of_job(job)
+    disk, brought, forged = world.disk, Counter[str](), Counter[str]()
+    for digest, worker, fitness in disk.read("SELECT digest, worker, fitness FROM recalled WHERE because = 'barred'"):
+        host = worker.partition("/")[0]
+        brought[host] += 1
+        forged[host] += fitness != fitness_of_job(disk.jobs[digest])
     return Found(
-        frozenset(f"w{host}" for host in lies), frozenset(tables["barred"]), brought, forged,
-        sum(because == "barred" for because, _ in tables["recalled"].values()), len(tables["verification"]),
-        len(tables["result"]), world.scored.steps / 100, honest,
+        frozenset(f"w{host}" for host in lies), frozenset(disk.barred), brought, forged, brought.total(),
+        world.count_checks(), world.counted_jobs, world.scored.steps / 100, honest,
     )  # fmt: skip
 
 

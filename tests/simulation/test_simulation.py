@@ -6,12 +6,7 @@ import pytest
 
 from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.jobs import generation
-from dreamfleet.coordinator.storage.journal import Journal
-from dreamfleet.coordinator.storage.recall_records import RecallRecords
-from dreamfleet.coordinator.storage.result_records import ResultRecords
-from dreamfleet.coordinator.storage.verification_records import VerificationRecords
 from tests.simulation.campaign import run, shrunk
-from tests.simulation.disk import MemoryJournal, MemoryRecalls, MemoryResults, MemoryVerification
 from tests.simulation.mutants import FOUND, MUTANTS
 from tests.simulation.schedule import KINDS, Schedule, Shape, draw
 from tests.simulation.shrink import Shrinker
@@ -92,11 +87,3 @@ def test_what_the_product_raises_is_a_violation_with_its_place(monkeypatch):
     outcome = play(Schedule(Shape(), ()))
     assert outcome.violation.rule == "raised"
     assert "in advance" in outcome.trace or "in tick" in outcome.trace
-
-
-def test_the_simulated_journal_has_all_that_the_real_one_has():
-    on_disk = {"create", "open_verified", "save_copy", "is_overwritten", "check_absent", "check_incarnation"}
-    on_disk |= {"is_closed", "errors_of", "with_digests", "forget_totals"}  # of batches, and of SQLite
-    for real, twin in ((Journal, MemoryJournal), (ResultRecords, MemoryResults), (RecallRecords, MemoryRecalls),
-                       (VerificationRecords, MemoryVerification)):  # fmt: skip
-        assert {name for name in vars(real) if not name.startswith("_")} - on_disk <= set(dir(twin))

@@ -23,7 +23,7 @@ from tests.simulation.network import LATENCY, Link
 from tests.simulation.schedule import Schedule, Shape
 from tests.simulation.truth import HopelessError, settings_of, truth_of
 from tests.simulation.violation import Violation
-from tests.simulation.witness import Witness
+from tests.simulation.witness import Confirmed, Witness
 from tests.simulation.worker import Scored, Token, Welcome, Worker
 
 PATIENCE = 120.0  # virtual seconds after the last fault in which everything must be finished
@@ -109,9 +109,10 @@ class World:
             if self.now > self._calm_at + self.patience or self.events > MAX_EVENTS:
                 self._give_up()
             action(*arguments)
+        self.disk.crash()
         self.witness.finished(self.disk)
         if self.shape.confirm_episodes and self.shape.ends and self.schedule.faults:
-            self.witness.confirmed(self.disk, _calm_disk(self.shape))
+            self.witness.confirmed(self.confirmed, _confirmed_in_calm(self.shape))
         self._check_waste()
 
     def later(self, seconds: float, action: Callable[..., None], *arguments: Any) -> None:
@@ -124,6 +125,7 @@ class World:
         """A life from what is on the disk, unless one is there."""
         if self.coordinator is not None or self._done:
             return
+        self.disk.crash()
         life = self.coordinator = Coordinator(self.disk, self.witness, self.shape, next(self._lives), self.now)
         self.coordinator_stopped = False
         self._operator_called = False
@@ -225,7 +227,7 @@ class World:
         if self.coordinator is not None and not self.coordinator_stopped:
             self.coordinator.run.bar(name, is_barred=is_barred)
             self.wake_coordinator(LINGER)
-        if (name in self.disk.tables["barred"]) != is_barred:
+        if (name in self.disk.barred) != is_barred:
             self.later(OPERATOR, self.bar, host, is_barred)
 
     def _pause_finally(self) -> None:
@@ -391,8 +393,7 @@ class World:
         """What is scored beyond what counts was lost by a fault, one worker's hands at most each."""
         if self.happened["bar"]:
             return  # all that a host ever brought and checked is scored again
-        checked = sum(bool(checker) for _, _, checker, _ in self.disk.tables["verification"].values())
-        vain = self.scored.steps / 100 - self.counted_jobs - checked - self.scored.failures
+        vain = self.scored.steps / 100 - self.counted_jobs - self.count_checks("checker != ''") - self.scored.failures
         hands, faults = 3 * self.shape.slots * min(self.shape.width, self.shape.most_jobs), len(self.schedule.faults)
         if vain > hands * (2 + faults):
             raise Violation("waste", f"{vain:.0f} jobs were scored in vain under {faults} faults")
@@ -400,20 +401,31 @@ class World:
     @property
     def counted_jobs(self) -> int:
         """Results on the disk."""
-        return len(self.disk.tables["result"])
+        return int(self.disk.read("SELECT count(*) FROM result")[0][0])
+
+    def count_checks(self, which: str = "true") -> int:
+        """Results that were checked, or drawn and not checked, of which that is so."""
+        query = f"SELECT count(DISTINCT digest) FROM verification WHERE stands AND {which}"
+        return int(self.disk.read(query)[0][0])
+
+    @property
+    def confirmed(self) -> Confirmed:
+        """What the run's end comes to."""
+        facts = self.disk.read("SELECT value FROM run WHERE key = 'confirmed'")
+        return facts[0][0] if facts else None, {digest for (digest,) in self.disk.read("SELECT digest FROM result")}
 
 
 _playing: list[World] = []
 
 
 @lru_cache(512)
-def _calm_disk(shape: Shape) -> Disk:
-    """What a run of this shape leaves behind when nobody disturbs it."""
+def _confirmed_in_calm(shape: Shape) -> Confirmed:
+    """What a run of this shape comes to when nobody disturbs it."""
     disturbed, calm = _playing[0], World(Schedule(shape, ()))
     _playing[0] = calm
     calm.play()
     _playing[0] = disturbed
-    return calm.disk
+    return calm.confirmed
 
 
 def play(schedule: Schedule) -> Outcome:
