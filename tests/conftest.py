@@ -1,5 +1,6 @@
 import os
 import re
+import shutil
 import signal
 import tempfile
 from importlib.metadata import entry_points
@@ -10,6 +11,7 @@ from hypothesis import settings
 
 from tests.support.bundles import write_random_bundle
 from tests.support.doom import require_doom
+from tests.support.journals import RUNS
 from tests.support.processes import processes_in
 from tests.support.programs import LIST, NOT_INSTALLED, require_programs
 
@@ -80,6 +82,15 @@ def trusted_tests():
 @pytest.fixture(scope="session")
 def random_bundle(tmp_path_factory):
     return write_random_bundle(tmp_path_factory.mktemp("bundle") / "random.zip")
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """Recorded runs, each with its world model."""
+    for name in ("dream", "reality", "hidden"):
+        shutil.copytree(RUNS / name, tmp_path / "runs" / name)
+        shutil.copyfile(RUNS.with_name("small.zip"), tmp_path / "runs" / name / "bundle.zip")
+    return tmp_path / "runs"
 
 
 @pytest.fixture

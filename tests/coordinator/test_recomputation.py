@@ -4,7 +4,6 @@ The file is the second opinion. So formulas stand here once more, and only the r
 """
 
 import csv
-import hashlib
 import json
 import sqlite3
 from contextlib import closing
@@ -16,16 +15,6 @@ import pytest
 from tests.support.processes import printed
 
 TASK, BRITTLE = "tests.support.tasks:Toy", "tests.support.tasks:Brittle"
-SCHEDULE = """
-[[stage]]
-generations = 3
-
-[[stage]]
-population = 9
-episodes = 5
-sigma0 = 0.2
-racing = true
-"""
 CHOOSING, CONFIRMING, FIRST_VALIDATION = 10_000, 20_000, 20_000  # episodes that choose, that confirm; the first seed
 CONFIRM_EPISODES, FINALISTS = 12, 4
 
@@ -69,34 +58,17 @@ class Recomputed:
         self.evaluated = {number: (np.frombuffer(each, "<f4"), *score) for number, each, *score in evaluated}
         self.settings = json.loads(self.facts["settings"])
 
-    def stage(self, generation):
-        """Population, episodes, racing, step size and number of the stage; stages here end by generations alone."""
-        found = {name: self.settings.get(name, False) for name in ("population", "episodes", "racing", "sigma0")}
-        number, until = 1, float("inf")
-        for index, stage in enumerate(self.settings.get("stages", []), 1):
-            if generation >= (0 if index == 1 else until):
-                number = index
-                found |= {name: stage[name] for name in found if name in stage}
-            until = stage.get("generations", float("inf"))
-        return found, number
-
     def fitness(self, generation):
-        """Each candidate's mean over its own episodes; NaN for one that failed. In a race the better half continues."""
-        stage, _ = self.stage(generation)
-        places = [("score", generation, number) for number in range(stage["population"])]
-        if any(place in self.failed for place in places):
-            assert not stage["racing"]
-            return np.array(
-                [np.nan if place in self.failed else
-                 np.mean([self.results[place][episode][1] for episode in range(stage["episodes"])]) for place in places]
-            )  # fmt: skip
-        rows = [self.results[place] for place in places]
-        first = -(-stage["episodes"] // 2) if stage["racing"] else stage["episodes"]
-        early = np.array([np.mean([row[episode][1] for episode in range(first)]) for row in rows])
-        better = set(np.argsort(-early, kind="stable")[: -(-len(rows) // 2)])
-        for number, row in enumerate(rows):
-            assert sorted(row) == list(range(stage["episodes"] if number in better else first))
-        return np.array([np.mean([row[episode][1] for episode in sorted(row)]) for row in rows])
+        """Each candidate's mean over its episodes; NaN for one that failed."""
+        found = []
+        for number in range(self.settings["population"]):
+            place = ("score", generation, number)
+            if place in self.failed:
+                found.append(np.nan)
+                continue
+            assert self.results[place].keys() == set(range(self.settings["episodes"]))
+            found.append(np.mean([fitness for _, (_, fitness, _) in sorted(self.results[place].items())]))
+        return np.array(found)
 
     def look(self, generation):
         """Mean, standard error and population deviation of one evaluation."""
@@ -140,34 +112,26 @@ class Recomputed:
         return left[0], scores.mean(), scores.std(ddof=1) / np.sqrt(len(scores))
 
 
-def search(mean, stage, number, seed):
-    """pycma with the run's random numbers; a later stage's search has a seed of its own."""
-    if number > 1:
-        text = f"dreamfleet search {seed} {number}".encode()
-        span, first = 2**53 - 2**20, 2**20
-        seed = (first + int.from_bytes(hashlib.sha256(text).digest()[:8], "little") % span) % 2**32
-    random = np.random.Generator(np.random.PCG64(seed))
+def search(settings, size):
+    """pycma with the run's random numbers."""
+    random = np.random.Generator(np.random.PCG64(settings["seed"]))
     options = {
-        "popsize": stage["population"], "CMA_diagonal": True, "seed": np.nan, "verbose": -9,
+        "popsize": settings["population"], "CMA_diagonal": True, "seed": np.nan, "verbose": -9,
         "randn": lambda *shape: random.standard_normal(shape),
     }  # fmt: skip
-    return cma.CMAEvolutionStrategy(mean, stage["sigma0"], options)
+    return cma.CMAEvolutionStrategy(np.zeros(size), settings["sigma0"], options)
 
 
 def check_search(found):
     """Population, step size, fitness, ranks and statistics of each generation, and the mean that was evaluated."""
-    strategy, begun = None, 0
+    strategy = search(found.settings, len(found.candidates[0, 0][0]))
     for number, seeds, sigma, mean, std, best, worst, steps in found.generations:
-        stage, place = found.stage(number)
-        if strategy is None or (place != begun and ("population" in stage)):
-            start = np.zeros(len(found.candidates[0, 0][0])) if strategy is None else strategy.mean
-            strategy, begun = search(start, stage, place, found.settings["seed"]), place
         assert sigma == pytest.approx(np.median(strategy.stds), rel=1e-12)
         asked = strategy.ask()
         for index, each in enumerate(asked):
             np.testing.assert_array_equal(found.candidates[number, index][0], np.asarray(each).astype("<f4"))
         assert (number, len(asked)) not in found.candidates
-        assert len(json.loads(seeds)) == stage["episodes"]
+        assert len(json.loads(seeds)) == found.settings["episodes"]
         if mean is None:
             continue  # the generation that was open at the end
         fitness = found.fitness(number)
@@ -237,16 +201,13 @@ def check_status(processes, name, found):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["plain", pytest.param("racing", marks=pytest.mark.long), "schedule"])
-def test_a_run_is_what_its_journal_comes_to(processes, random_bundle, kind):
-    flags = {"plain": (), "racing": ("--racing",), "schedule": ("--schedule", processes.folder / "stages.toml")}[kind]
-    (processes.folder / "stages.toml").write_text(SCHEDULE)
-    answer = started(processes, kind, random_bundle, *flags)
-    found = Recomputed(processes.runs / kind / "journal.sqlite")
+def test_a_run_is_what_its_journal_comes_to(processes, random_bundle):
+    answer = started(processes, "plain", random_bundle)
+    found = Recomputed(processes.runs / "plain" / "journal.sqlite")
     assert len(found.generations) == 7
     check_search(found)
-    check_scores(processes, kind, found, answer)
-    check_status(processes, kind, found)
+    check_scores(processes, "plain", found, answer)
+    check_status(processes, "plain", found)
 
 
 @pytest.mark.slow

@@ -68,7 +68,6 @@ def test_a_noisy_search_gives_the_mean_that_was_judged_and_has_no_more_calls_tha
         (StopKind.ONE_POINT, False, objectives.sphere, {"stagnation": 0, "popsize": 16, "ftarget": -1.0}),
         (StopKind.STAGNATION, True, objectives.flat, {"stagnation": 2}),
         (StopKind.TARGET, True, objectives.noisy, {"ftarget": 100.0, "evaluate_every": 1, "confirm_episodes": 0}),
-        (StopKind.MINUTES, False, objectives.flat, {"minutes": 0.001}),
     ],
 )
 def test_a_search_succeeds_where_it_converged_or_reached_its_target(kind, success, function, given, tmp_path):
@@ -167,14 +166,6 @@ def test_a_search_that_loses_all_values_returns_what_it_found(tmp_path, monkeypa
     assert found.fun <= found.history[-1].fun
     assert not found.success
     assert stop_kind(found, tmp_path / "runs") is None, "it was left open"
-
-
-@pytest.mark.slow
-def test_a_fixed_parameter_stays_and_an_object_is_a_function(tmp_path):
-    bounds = [(0, 4), (2, 2)]
-    found = dreamfleet.minimise(objectives.weighted, [3, 2], bounds=bounds, generations=3, runs_dir=tmp_path, **FEW)
-    assert {float(each.x[1]) for each in found.history} == {2.0}
-    assert found.fun == objectives.weighted(found.x) < objectives.weighted(np.array([3, 2]))
 
 
 @pytest.mark.slow

@@ -7,13 +7,11 @@ import numpy as np
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.protocol.batches import BatchReply, pack_batch
 from dreamfleet.common.protocol.codec import encode_json
-from dreamfleet.common.protocol.messages import MAX_MESSAGE, MAX_PART, Result
+from dreamfleet.common.protocol.messages import MAX_MESSAGE, MAX_PART
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.coordinator.run.batches import Batches
-from dreamfleet.coordinator.run.run import Run
-from dreamfleet.coordinator.settings.limits import LimitsConfig
-from dreamfleet.coordinator.settings.network import NetworkConfig
-from dreamfleet.coordinator.storage.journal import Journal
+from tests.support.dispatched import result
+from tests.support.run_bench import Bench
 from tests.support.samples import SPEC
 
 SHAPE = ControllerShape(1, 3)
@@ -26,27 +24,20 @@ SETTINGS = RunSettings(
 )  # fmt: skip
 
 
-class Door:
+class Door(Bench):
     """A run in a folder and the queries to it; the test itself is the worker."""
 
+    workers = ()
+
     def __init__(self, path):
-        self.path, self.now, self.scored = path, 0.0, []
-        path.mkdir(parents=True)
-        self.journal = Journal.create(path, SETTINGS, None)
-        self.begin()
+        self.scored = []
+        super().__init__(path, None, SETTINGS, generations=0)
 
     def begin(self):
-        self.run = Run(self.journal, SETTINGS, LimitsConfig(), NetworkConfig(), self.now)
+        super().begin()
         self.batches = Batches(self.run, "search")
-        self.step()
 
-    def restart(self):
-        """Lose what is not committed."""
-        self.journal.close()
-        self.journal = Journal(self.path / "journal.sqlite")
-        self.begin()
-
-    def step(self):
+    def go_on(self):
         self.run.advance(self.now)
         assert self.run.commit()
 
@@ -73,8 +64,8 @@ class Door:
             fitness = float(np.frombuffer(work.vector, "<f4").sum()) + work.job.seeds[0]
             self.scored.append(work.job.digest)
             self.run.fleet.leases.withdraw([work.job.digest])
-            self.run.record_result(work, Result(work.job.digest, fitness, 7, 0.1, None, None), "a/1", "f", "c")
-        self.step()
+            self.run.record_result(work, result(work.digest, fitness, steps=7), "a/1", "f", "c")
+        self.go_on()
 
 
 def vectors(count, first=0.0):

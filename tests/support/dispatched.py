@@ -39,8 +39,8 @@ def beat(capacity=1, seen=0, numbering=0, queued=(), running=(), unacked=(), rat
     )  # fmt: skip
 
 
-def result(digest, fitness=1.0, error=None):
-    return Result(digest, None if error else fitness, 10, 0.1, error, None)
+def result(digest, fitness=1.0, error=None, steps=10):
+    return Result(digest, None if error else fitness, steps, 0.1, error, None)
 
 
 def fleet_of(*names, capacity=1, jobs=10):

@@ -2,8 +2,8 @@
 
 from dataclasses import replace
 
-from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.run_folder import RunFolder
+from tests.support.dispatched import result
 from tests.support.failures import failure
 from tests.support.run_bench import SETTINGS as TWO
 from tests.support.run_bench import A, B, Bench
@@ -30,19 +30,17 @@ class Failing(Bench):
         for name in {A, B}.difference(hosts):
             self.run.fleet.handle_departure(name, self.now)
 
-    def begin(self):
-        super().begin()
-        for name in self.hosts:
-            self.handle_heartbeat(name, host_class=self.host_class)
+    def fitness_of(self, job):
+        return int.from_bytes(job.digest[:3]) / 1e6
 
     def answer_one(self, name, job):
         if self.host_errors:
-            result = Result(job.digest, None, 0, 0.1, self.host_errors.pop(), None)
+            answer = result(job.digest, error=self.host_errors.pop(), steps=0)
         elif self.fails(job):
-            result = Result(job.digest, None, 3, 0.1, failure("ValueError", f"at {id(job):#x} on {name}"), None)
+            answer = result(job.digest, error=failure("ValueError", f"at {id(job):#x} on {name}"), steps=3)
         else:
-            result = Result(job.digest, int.from_bytes(job.digest[:3]) / 1e6, 10, 0.1, None, None)
-        self.deliver(name, result)
+            answer = result(job.digest, self.fitness_of(job))
+        self.deliver(name, answer)
 
     def serve(self, turns=400, stop=lambda run: False):
         for _ in range(turns):
@@ -51,10 +49,9 @@ class Failing(Bench):
             self.wait()
             self.run.advance(self.now)
             for name in self.hosts:
-                self.handle_heartbeat(name, host_class=self.host_class)
-            for send in self.run.fleet.dispatch(self.now):
-                for work in send.work:
-                    self.answer_one(send.identity, work.job)
+                self.handle_heartbeat(name)
+            for name, job in self.fetch():
+                self.answer_one(name, job)
         raise AssertionError("the run does not end")
 
     def story(self):

@@ -2,9 +2,13 @@
 
 import sqlite3
 from contextlib import closing
+from pathlib import Path
 
-from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.records import StoredConfirmation
+from dreamfleet.common.runs.run_folder import CONFIRMED, RunFolder
 from dreamfleet.common.runs.run_paths import JOURNAL
+
+RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
 
 
 def change_journal(run, statement, *values):
@@ -19,3 +23,8 @@ def change_settings(run, change):
         text = change(stored.settings).to_json()
     change_journal(run, "UPDATE run SET value = ? WHERE key = 'settings'", text)
     return text
+
+
+def confirm(run, *figures):
+    """Store a confirmation of these figures in the folder `run`."""
+    change_journal(run, "INSERT INTO run VALUES (?, ?)", CONFIRMED, StoredConfirmation(*figures).to_json())

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.run_paths import CONTROLLER
 from tests.support.run_bench import SETTINGS, Bench
 
@@ -13,19 +12,8 @@ SCORES = {1: 10.0, 3: 5.0}  # of the mean after a generation
 
 
 class Reporting(Bench):
-    given: list
-
-    def begin(self):
-        self.given = []
-        super().begin()
-
-    def step(self):
-        """Answer the first job."""
-        for send in self.run.fleet.dispatch(self.now):
-            self.given += [work.job for work in send.work]
-        job = self.given.pop(0)
-        fitness = SCORES[job.generation] if job.kind == "evaluate" else float(job.digest[0])
-        self.answer(Result(job.digest, fitness, 10, 0.1, None, None))
+    def fitness_of(self, job):
+        return SCORES[job.generation] if job.kind == "evaluate" else float(job.digest[0])
 
     def close(self, generations):
         """Answer jobs until so many generations are closed and no background job is in progress."""

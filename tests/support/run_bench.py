@@ -21,6 +21,7 @@ from dreamfleet.coordinator.run.worker_protocol import WorkerProtocol
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
+from tests.support.dispatched import result
 from tests.support.samples import SPEC
 
 A, B = "a/00000001", "b/00000002"
@@ -39,6 +40,7 @@ class Bench:
     strict = False
     failure_limit = 0.5
     host_class = class_from_fingerprint("f")  # of both workers
+    workers = (A, B)
 
     def __init__(self, path, bundle, settings=SETTINGS, generations=1):
         self.path, self.now = path, 0.0
@@ -48,17 +50,30 @@ class Bench:
         self.begin()
 
     def begin(self):
+        self.given = []  # jobs that were fetched and not finished
         network = NetworkConfig(beat=1.0, strict=self.strict, failure_limit=self.failure_limit)
         self.run = Run(self.journal, self.settings, self.limits, network, self.now)
         self.worker_protocol = WorkerProtocol(self.run, "night", "n", Intervals(1.0, 1.0))
         self.run.advance(self.now)
         self.run.commit()
-        for name in (A, B):
-            self.run.admission.admit(self.request(name), self.now)
+        for name in self.workers:
+            self.admit(name)
             self.handle_heartbeat(name)
 
+    def fingerprint_of(self, name):
+        return "f"
+
+    def class_of(self, name):
+        """As far as the worker knows its class."""
+        return self.host_class
+
     def request(self, name):
-        return HelloRequest(2, 2, "0", name, (SPEC.task,), "f", 1, host_class=self.host_class)
+        known = {"host_class": self.class_of(name)}
+        return HelloRequest(2, 2, "0", name, (SPEC.task,), self.fingerprint_of(name), 1, **known)
+
+    def admit(self, *names):
+        for name in names:
+            self.run.admission.admit(self.request(name), self.now)
 
     def restart(self):
         """Kill the coordinator, which loses everything that is not committed, and begin the next incarnation."""
@@ -71,7 +86,7 @@ class Bench:
         self.now += seconds
         self.run.tick(self.now)
 
-    def handle_heartbeat(self, name, unacked=(), host_class=""):
+    def handle_heartbeat(self, name, unacked=()):
         if (member := self.run.fleet.members.get(name)) is None:
             return
         head = {"run_uid": self.run.uid, "incarnation": self.run.incarnation, "nonce": "n", "drawn_by": "-",
@@ -80,15 +95,18 @@ class Bench:
         self.worker_protocol.handle_heartbeat(
             name,
             Heartbeat(**head, seen=member.number, capacity=4, slots=4, queued=(), running=(), unacked=tags, load=0.0,
-                 steps_per_second=0.0, host_class=host_class),
+                 steps_per_second=0.0, host_class=self.class_of(name)),
             self.now,
         )  # fmt: skip
 
-    def deliver(self, name, result):
-        batch = ResultBatch(
-            run_uid=self.run.uid, incarnation=1, fingerprint="f", results=(result,), host_class=self.host_class
-        )
+    def send(self, name, *results):
+        """A worker's results arrive, and the run has not gone on yet."""
+        known = {"fingerprint": self.fingerprint_of(name), "host_class": self.class_of(name)}
+        batch = ResultBatch(run_uid=self.run.uid, incarnation=1, results=results, **known)
         self.worker_protocol.handle_results(name, batch, self.now)
+
+    def deliver(self, name, result):
+        self.send(name, result)
         self.run.advance(self.now)
         self.run.commit()
 
@@ -114,11 +132,33 @@ class Bench:
         sends = self.run.fleet.dispatch(self.now)
         return [(send.identity, each.digest, each.verdict) for send in sends for each in send.verdicts]
 
+    def fetch(self):
+        """What is given now: each job with its worker."""
+        fetched = [(send.identity, work.job) for send in self.run.fleet.dispatch(self.now) for work in send.work]
+        self.given += [job for _, job in fetched]
+        return fetched
+
+    def fitness_of(self, job):
+        """What `finish` says of a job."""
+        return 1.0
+
+    def finish(self, index=0):
+        job = self.given.pop(index)
+        self.answer(result(job.digest, self.fitness_of(job)))
+
+    def step(self):
+        """Answer the first job that was given."""
+        self.fetch()
+        self.finish()
+
+    def end(self):
+        while self.run.state.ended is None:
+            self.step()
+
     def score(self, fitness=lambda job: 1.0):
         """Score what is given now."""
-        for send in self.run.fleet.dispatch(self.now):
-            for work in send.work:
-                self.deliver(send.identity, Result(work.job.digest, fitness(work.job), 10, 0.1, None, None))
+        for name, job in self.fetch():
+            self.deliver(name, result(job.digest, fitness(job)))
 
     def reach_collection(self):
         """Score the only generation; the collection jobs, each with its holder."""
@@ -127,9 +167,7 @@ class Bench:
         return self.collecting()
 
     def collecting(self):
-        given = {}
-        for send in self.run.fleet.dispatch(self.now):
-            given.update({work.job.episode: (send.identity, work.job) for work in send.work})
+        given = {job.episode: (name, job) for name, job in self.fetch()}
         return [given[episode] for episode in sorted(given)]
 
     def kept(self):

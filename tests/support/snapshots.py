@@ -4,7 +4,6 @@ import dataclasses
 from collections import Counter
 
 from dreamfleet.common.client.status import read_document
-from dreamfleet.common.protocol.messages import Result
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.service.status import encode_part
 from tests.support.run_bench import SETTINGS
@@ -14,12 +13,9 @@ SCORED = dataclasses.replace(SETTINGS, population=4, episodes=2, collect_every=0
 
 def score(bench, count, fitness=lambda job: job.candidate + job.episode / 2):
     """Answer `count` jobs, one after the other."""
-    while count:
-        for send in bench.run.fleet.dispatch(bench.now):
-            bench.given = getattr(bench, "given", []) + [work.job for work in send.work]
-        job = bench.given.pop(0)
-        bench.answer(Result(job.digest, fitness(job), 10, 0.1, None, None))
-        count -= 1
+    bench.fitness_of = fitness
+    for _ in range(count):
+        bench.step()
 
 
 def snapshot_of(bench):

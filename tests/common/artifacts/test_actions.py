@@ -3,7 +3,7 @@ import re
 import numpy as np
 import pytest
 
-from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Continuous, Mirror, grouped, one_hot
+from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Mirror, grouped, one_hot
 from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.errors import UsageError
 
@@ -54,14 +54,6 @@ def test_actions_convert_back_to_outputs():
     )
     action = np.array([[0.1, 0.2, 0.3]], np.float32)
     assert STEERING_GAS_BRAKE.to_outputs(action) is action
-
-
-def test_each_action_has_its_own_output_by_default():
-    assert (STEERING_GAS_BRAKE.outputs, STEERING_GAS_BRAKE.actions) == (3, 3)
-    assert Continuous.between([-1, -2], [1, 2]).output_indices == ()
-    logits = np.random.default_rng(0).normal(size=3).astype(np.float32)
-    own = Continuous(*(getattr(STEERING_GAS_BRAKE, name) for name in ("scale", "shift", "low", "high")), (0, 1, 2))
-    assert np.array_equal(own.to_action(logits), STEERING_GAS_BRAKE.to_action(logits))
 
 
 def test_a_mirror_is_exact_and_twice_nothing():

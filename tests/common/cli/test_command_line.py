@@ -20,9 +20,9 @@ from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host import packages
 from dreamfleet.common.host.standard_streams import LAST_STREAM
 from tests.fuzz.calls import flags_with_values
+from tests.support.journals import RUNS
 from tests.support.processes import DEADLINE
 
-RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
 BROKEN = EntryPoint("broken", "tests.no_such_module", command_line.GROUP)
 
 

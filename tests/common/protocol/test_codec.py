@@ -6,9 +6,7 @@ Tests messages.py.
 """
 
 import dataclasses
-import gc
 import json
-import tracemalloc
 from pathlib import Path
 
 import msgpack
@@ -119,35 +117,12 @@ def test_random_bytes_never_raise_past_the_inbox(payload):
     assert inbox.dropped.total() == 1 + len(Message.__subclasses__())
 
 
-def decode_all(count, seed):
-    inbox, good = CountingDecoder(), 0
-    kinds = list(MSGPACK.values())
-    for number, payload in enumerate(mutations(count, seed)):
+def test_damaged_messages_never_raise_and_are_all_counted_by_few_reasons():
+    inbox, good, kinds = CountingDecoder(), 0, list(MSGPACK.values())
+    for number, payload in enumerate(mutations(20_000, seed=1)):
         good += inbox.decode(type(kinds[number % len(kinds)]), payload) is not None
-    return inbox, good
-
-
-def test_damaged_messages_never_raise_and_are_all_counted():
-    inbox, good = decode_all(20_000, seed=1)
-    assert sum(inbox.dropped.values()) + good == 20_000
-
-
-@pytest.mark.long
-@pytest.mark.timeout(1200)
-def test_a_million_damaged_messages_never_raise_are_all_counted_and_leave_nothing_behind():
-    decode_all(1000, seed=2)
-    tracemalloc.start()
-    held = []
-    for count, seed in ((200_000, 3), (400_000, 4), (400_000, 5)):
-        inbox, good = decode_all(count, seed)
-        assert sum(inbox.dropped.values()) + good == count
-        assert len(inbox.dropped) < 20
-        del inbox
-        gc.collect()
-        held.append(tracemalloc.get_traced_memory()[0])
-    tracemalloc.stop()
-    # The interpreter's table of names grows by megabytes, but once: a leak would grow in each part.
-    assert min(held[1] - held[0], held[2] - held[1]) < 100_000
+    assert inbox.dropped.total() + good == 20_000
+    assert len(inbox.dropped) < 20
 
 
 def test_hello_ignores_fields_of_later_versions_and_half_a_surrogate_pair_is_malformed():

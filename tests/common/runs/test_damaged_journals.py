@@ -17,13 +17,12 @@ from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from tests.support.journals import change_journal
 from tests.support.mutations import mutate
 
-RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
 VALUES = [None, "x", b"x", -1, 2**62, 1e308, "1e5", "[" * 3000, "9" * 5000, "\ud7ff"]
 
 
 @pytest.fixture
-def folder(tmp_path):
-    return shutil.copytree(RUNS / "dream", tmp_path / "night")
+def folder(runs):
+    return runs / "dream"
 
 
 def look(folder):

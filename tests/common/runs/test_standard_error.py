@@ -1,14 +1,10 @@
 from math import sqrt
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from dreamfleet.common.runs.records import StoredConfirmation, StoredEvaluation, describe_score, format_mean, with_error
-from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.standard_error import format_with_error, sample_std, standard_error
-
-RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
 
 
 def test_a_standard_error_has_the_samples_standard_deviation():
@@ -41,14 +37,3 @@ def test_a_small_score_has_enough_digits_and_a_zero_no_sign():
     }  # fmt: skip
     assert {text: format_with_error(*figures) for text, figures in shown.items()} == {text: text for text in shown}
     assert format_with_error(0.5, 0.25, 2, sign="+") == "+0.50 ± 0.25"
-
-
-@pytest.mark.parametrize("name", ["dream", "reality"])
-def test_evaluations_of_journals_of_earlier_versions_have_the_errors_of_their_results(name):
-    with RunFolder(RUNS / name) as run:
-        evaluations = run.evaluations()
-        assert evaluations
-        for each in evaluations:
-            scores = list(run.scores(each.generation).values())
-            assert len(scores) == each.episodes
-            assert each.error == pytest.approx(np.std(scores, ddof=1) / sqrt(len(scores)))

@@ -3,7 +3,6 @@ Tests common/files/sqlite.py."""
 
 import gc
 import resource
-import shutil
 import sqlite3
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
@@ -18,13 +17,12 @@ from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.coordinator.storage.journal_file import journal_errors
 from tests.support.journals import change_journal
 
-RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
 THREADS = 4
 
 
 @pytest.fixture
-def folder(tmp_path):
-    return shutil.copytree(RUNS / "dream", tmp_path / "night")
+def folder(runs):
+    return runs / "dream"
 
 
 def in_thread(call, *given):

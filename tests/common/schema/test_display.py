@@ -12,8 +12,9 @@ from dreamfleet.common.client.status import WorkerStatus, read_document, read_st
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.coordinator.addons.runs.stored_run import StoredRun
+from tests.support.journals import RUNS
 
-GOLDEN, RUNS = Path(__file__).parents[1] / "golden", Path(__file__).parents[2] / "fixtures" / "runs"
+GOLDEN = Path(__file__).parents[1] / "golden"
 SHAPE = ControllerShape(4, 2, hidden=3)
 CONTROLLER = Controller(SHAPE, np.zeros(SHAPE.size, np.float32), "gym:CartPole-v1", "", {"generation": 7})
 WORKER = WorkerStatus("alpha/0011aabb", "lost", 2, 1, 14, 1234.5, 0.5, "native", 3.25, "f", reason="it was stopped")

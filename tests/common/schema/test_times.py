@@ -1,6 +1,3 @@
-import shutil
-from pathlib import Path
-
 import pytest
 
 from dreamfleet.common.cli.command_line import main
@@ -8,7 +5,6 @@ from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.schema.times import elapsed_seconds, format_time
 from tests.support.journals import change_journal
 
-RUNS = Path(__file__).parents[2] / "fixtures" / "runs"
 ENDED = "2026-01-01T00:00:00+00:00"
 
 
@@ -29,8 +25,7 @@ def test_a_moment_for_people():
 
 @pytest.mark.add_on
 @pytest.mark.parametrize("begun", [None, "", "x", "1970-01-01T00:00:00", "9999-12-31T23:59:59-23:00"])
-def test_every_verb_about_a_run_reads_its_odd_times(begun, tmp_path, capsys):
-    runs = shutil.copytree(RUNS, tmp_path / "runs")
+def test_every_verb_about_a_run_reads_its_odd_times(begun, runs, capsys):
     change_journal(runs / "reality", "INSERT OR REPLACE INTO run VALUES ('ended_at', ?)", ENDED)
     change_journal(runs / "reality", "DELETE FROM run WHERE key = 'created'")
     if begun is not None:

@@ -8,7 +8,7 @@ import pytest
 from tests.support.fleets import Host, Played
 
 GENERATIONS, FIRST = 60, 10  # the first few find out how bad it is
-FAST = {"narrow": {"row": 0.02}, "wide": {"width": 256, "turn": 0.4, "row": 0.005}}
+FAST = {"narrow": {"width": 1, "turn": 0.0, "row": 0.02}, "wide": {"width": 256, "turn": 0.4, "row": 0.005}}
 BAD = {
     "slow link": {"bandwidth": 32_000, "delay": 2.0},
     "thin link": {"bandwidth": 8_000, "delay": 0.05},
@@ -22,7 +22,7 @@ BAD = {
 
 
 def made(name, fast, slower=1, **bad):
-    return Host(name, **{**fast, "turn": fast.get("turn", 0.0) * slower, "row": fast["row"] * slower, **bad})
+    return Host(name, {"score": fast["row"] * slower}, width=fast["width"], turn=fast["turn"] * slower, **bad)
 
 
 def mean_seconds(*hosts, size):

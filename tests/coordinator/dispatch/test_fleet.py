@@ -280,22 +280,22 @@ def test_the_only_worker_tries_a_failed_job_again_but_not_for_ever():
 
 
 @pytest.mark.parametrize(
-    ("share", "kinds"), [(0.25, ["evaluate", *["score"] * 3]), (0.0, [*["score"] * 3, "evaluate"])]
+    ("share", "capacity", "offered", "kinds"),
+    [
+        (0.25, 4, work(3) + work(5, "evaluate"), ["evaluate", *["score"] * 3]),
+        (0.0, 4, work(3) + work(5, "evaluate"), [*["score"] * 3, "evaluate"]),
+        (0.25, 8, work(1, "evaluate") + work(5, "collect"), ["evaluate", "collect"]),
+    ],
 )
-def test_evaluations_fill_a_quarter_of_the_idle_slots_and_lead_where_they_have_a_share(share, kinds):
+def test_evaluations_and_drives_fill_a_quarter_of_the_idle_slots_and_lead_where_they_have_a_share(
+    share, capacity, offered, kinds
+):
     fleet = Fleet(BEAT, share)
-    join(fleet, A, 0.0, 4)
-    fleet.jobs.offer(work(3) + work(5, "evaluate"))
+    join(fleet, A, 0.0, capacity)
+    fleet.jobs.offer(offered)
     assert [each.job.kind for send in fleet.dispatch(0.0) for each in send.work] == kinds
     fleet.drain_background = True
     assert len(digests(fleet.dispatch(0.1), A)) == 4
-
-
-def test_evaluations_and_collected_drives_share_the_quarter():
-    fleet = fleet_of(A, capacity=8, jobs=0)
-    fleet.jobs.offer(work(1, "evaluate") + work(5, "collect"))
-    kinds = [each.job.kind for send in fleet.dispatch(0.0) for each in send.work]
-    assert kinds == ["evaluate", "collect"]
 
 
 def uploading():

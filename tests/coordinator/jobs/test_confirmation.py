@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import CONTROLLER
@@ -38,22 +37,11 @@ class Judging(Bench):
 
     judged: list
 
-    def begin(self):
-        self.held = []
-        super().begin()
-
-    def step(self):
-        for send in self.run.fleet.dispatch(self.now):
-            self.held += [work.job for work in send.work]
-        job = self.held.pop(0)
-        fitness = drive(job) if job.kind == "evaluate" else float(job.digest[0])
-        if job.kind == "evaluate":
-            self.judged.append(job)
-        self.answer(Result(job.digest, fitness, 10, 0.1, None, None))
-
-    def end(self):
-        while self.run.state.ended is None:
-            self.step()
+    def fitness_of(self, job):
+        if job.kind != "evaluate":
+            return float(job.digest[0])
+        self.judged.append(job)
+        return drive(job)
 
     @property
     def tracks(self):
@@ -135,18 +123,6 @@ def test_in_any_order_and_whatever_is_known_already_the_outcome_is_the_same(coun
         return confirmation.outcome
 
     assert outcome(0.0) == outcome(known, np.random.default_rng(seed)) == outcome(1.0)
-
-
-def test_a_run_that_is_left_open_reports_a_provisional_score(make):
-    bench = make()
-    while len(bench.run.background_jobs.evaluations) < 4:
-        bench.step()
-    bench.run.leave()
-    confirmed, controller, evaluations = bench.outcome()
-    best = max(evaluations, key=lambda each: each.mean)
-    assert confirmed is None
-    named = [controller.provenance[each] for each in ("confirmed", "validation_mean", "validation_episodes")]
-    assert named == [False, best.mean, 4]
 
 
 def test_a_run_that_ended_goes_on_and_is_confirmed_again(make):

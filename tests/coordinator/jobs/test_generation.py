@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from dreamfleet.coordinator.jobs import generation as generation_module
 from dreamfleet.coordinator.jobs.generation import Generation
-from dreamfleet.coordinator.jobs.work import make_work, vector_bytes
+from dreamfleet.coordinator.jobs.work import vector_bytes
 from tests.support.samples import SPEC
 
 DREAM = replace(SPEC, task="dream")
@@ -176,13 +176,3 @@ def test_a_generation_that_recalls_any_results_in_any_order_is_one_that_was_scor
     np.testing.assert_array_equal(recalled.measures(), fresh.measures())
     assert recalled.candidate_scores() == fresh.candidate_scores()
     assert {work.digest for work in recalled.counted} == {work.digest for work in fresh.counted}
-
-
-@pytest.mark.parametrize(
-    ("kind", "vector", "seeds"),
-    [("evaluate", VECTORS[0], (1,)), ("score", VECTORS[1], (1,)), ("score", VECTORS[0], (2,))],
-)
-def test_a_digest_is_of_kind_vector_and_seeds(kind, vector, seeds):
-    (one,) = make_work(SPEC, "score", 0, 0, VECTORS[0], (1,))
-    (other,) = make_work(SPEC, kind, 0, 0, vector, seeds)
-    assert one.job.digest != other.job.digest

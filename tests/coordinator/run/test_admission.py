@@ -6,11 +6,10 @@ from dataclasses import replace
 import pytest
 
 from dreamfleet.common.protocol.host_classes import class_from_fingerprint
-from dreamfleet.common.protocol.messages import HelloRequest, Result, ResultBatch
 from dreamfleet.common.runs.run_folder import RunFolder
+from tests.support.dispatched import result
 from tests.support.failures import failure
 from tests.support.run_bench import SETTINGS, A, B, Bench
-from tests.support.samples import SPEC
 
 PLAIN = replace(SETTINGS, collect_every=0, population=4)
 HERE, ELSEWHERE = class_from_fingerprint("here"), class_from_fingerprint("elsewhere")
@@ -27,35 +26,33 @@ class Classed(Bench):
         self.announced = {A: "", B: ""}
         super().begin()
 
+    def fingerprint_of(self, name):
+        return self.fingerprints[name]
+
+    def class_of(self, name):
+        return self.announced[name]  # a worker finds out its class after it has joined
+
     def find_out(self, name):
         """The worker's child processes find its class, and its heartbeat says so."""
         self.announced[name] = self.classes[name]
-        self.handle_heartbeat(name, host_class=self.classes[name])
-
-    def request(self, name):
-        known = self.announced[name]  # a worker finds out its class after it has joined
-        return HelloRequest(2, 2, "0", name, (SPEC.task,), self.fingerprints[name], 1, host_class=known)
+        self.handle_heartbeat(name)
 
     def hello(self, name):
         """Why the worker is refused; `None` if it may join."""
         found = self.run.admission.find_refusal(self.request(name))
         if found is None:
-            self.run.admission.admit(self.request(name), self.now)
+            self.admit(name)
             self.handle_heartbeat(name)
         return found
 
-    def deliver(self, name, result):
+    def send(self, name, *results):
         self.announced[name] = self.classes[name]
-        batch = ResultBatch(
-            run_uid=self.run.uid, incarnation=1, fingerprint=self.fingerprints[name], results=(result,),
-            host_class=self.classes[name],
-        )  # fmt: skip
-        self.worker_protocol.handle_results(name, batch, self.now)
-        self.run.advance(self.now)
-        self.run.commit()
+        super().send(name, *results)
 
-    def given(self):
-        return {send.identity: [work.job for work in send.work] for send in self.run.fleet.dispatch(self.now)}
+    def digests(self):
+        """Of the jobs that each worker is given now."""
+        fetched = self.fetch()
+        return {name: [job.digest for worker, job in fetched if worker == name] for name in (A, B)}
 
     def stored(self):
         with RunFolder(self.path) as folder:
@@ -65,10 +62,6 @@ class Classed(Bench):
 @pytest.fixture
 def bench(make_bench):
     return make_bench(Classed, PLAIN)
-
-
-def done(job):
-    return Result(job.digest, 1.0, 10, 0.1, None, None)
 
 
 class ByFingerprint(Classed):
@@ -81,15 +74,15 @@ class ByFingerprint(Classed):
 def test_the_first_accepted_result_fixes_the_class_and_the_other_host_is_removed(make_bench, kind):
     bench = make_bench(kind, PLAIN)
     own = kind.classes[B]
-    jobs = bench.given()
-    bench.deliver(B, done(jobs[B][0]))
+    jobs = bench.digests()
+    bench.deliver(B, result(jobs[B][0]))
     assert (bench.run.admission.host_class, bench.run.admission.fingerprint) == (own, "elsewhere")
-    bench.deliver(A, done(jobs[A][0]))
+    bench.deliver(A, result(jobs[A][0]))
     assert bench.run.generation.done == 1, "a result of another class does not count"
     assert list(bench.run.fleet.members) == [B]
     assert "--no-strict" in bench.hello(A).remedy
     assert any((note.what, note.worker) == ("left", A) for note in bench.run.take_notes())
-    assert {job.digest for job in bench.given()[B]} >= {job.digest for job in jobs[A]}, "its jobs are free again"
+    assert {*bench.digests()[B]} >= {*jobs[A]}, "its jobs are free again"
     assert bench.run.fleet.jobs.failures == [], "it is no failure of the job"
     bench.restart()
     assert bench.run.admission.host_class == own
@@ -97,8 +90,8 @@ def test_the_first_accepted_result_fixes_the_class_and_the_other_host_is_removed
 
 
 def test_a_worker_of_another_class_is_removed_before_it_gets_work(bench):
-    jobs = bench.given()
-    bench.deliver(B, done(jobs[B][0]))
+    jobs = bench.digests()
+    bench.deliver(B, result(jobs[B][0]))
     bench.run.fleet.remove_worker(A)
     assert bench.hello(A) is None, "it does not know its class yet"
     bench.find_out(A)
@@ -111,14 +104,14 @@ def test_a_worker_of_another_class_is_removed_before_it_gets_work(bench):
 def test_hosts_of_one_fingerprint_may_be_of_two_classes_and_of_two_fingerprints_of_one(bench):
     bench.fingerprints = {A: "here", B: "here"}
     bench.restart()
-    jobs = bench.given()
-    bench.deliver(B, done(jobs[B][0]))
-    bench.deliver(A, done(jobs[A][0]))
+    jobs = bench.digests()
+    bench.deliver(B, result(jobs[B][0]))
+    bench.deliver(A, result(jobs[A][0]))
     assert bench.run.generation.done == 1
     bench.fingerprints, bench.classes = {A: "there", B: "here"}, {A: "b" * 16, B: "b" * 16}
     bench.announced[A] = ""
     assert bench.hello(A) is None
-    bench.deliver(A, done(jobs[A][0]))
+    bench.deliver(A, result(jobs[A][0]))
     assert bench.run.generation.done == 2
     assert bench.stored() == {"b" * 16}
     (share,) = bench.run.journal.results.classes.largest
@@ -126,28 +119,28 @@ def test_hosts_of_one_fingerprint_may_be_of_two_classes_and_of_two_fingerprints_
 
 
 def test_neither_a_hello_nor_an_error_fixes_the_class(bench):
-    jobs = bench.given()
-    bench.deliver(B, Result(jobs[B][0].digest, None, 0, 0.1, failure("boom"), None))
+    jobs = bench.digests()
+    bench.deliver(B, result(jobs[B][0], error=failure("boom")))
     assert bench.run.admission.host_class is None
     assert bench.hello(A) is bench.hello(B) is None
-    bench.deliver(A, done(jobs[A][0]))
+    bench.deliver(A, result(jobs[A][0]))
     assert bench.run.admission.host_class == "a" * 16
 
 
 def test_a_result_of_another_life_is_judged_before_its_worker_says_hello(bench):
-    jobs = bench.given()
-    bench.deliver(A, done(jobs[A][0]))
+    jobs = bench.digests()
+    bench.deliver(A, result(jobs[A][0]))
     bench.restart()
-    bench.deliver(B, done(jobs[B][0]))
+    bench.deliver(B, result(jobs[B][0]))
     assert bench.run.generation.done == 1
 
 
 @pytest.mark.parametrize("classes", [{A: "a" * 16, B: "b" * 16}, {A: HERE, B: "b" * 16}, {A: "a" * 16, B: ELSEWHERE}])
 def test_a_run_that_is_not_strict_accepts_all_classes_and_records_each_results_class(make_bench, classes):
     bench = make_bench(type("Open", (Classed,), {"strict": False, "classes": classes}), PLAIN)
-    jobs = bench.given()
+    jobs = bench.digests()
     for name in (A, B):
-        bench.deliver(name, done(jobs[name][0]))
+        bench.deliver(name, result(jobs[name][0]))
     assert bench.run.generation.done == 2
     assert bench.hello(A) is bench.hello(B) is None
     # If the class of the first accepted result is that of its fingerprint, so are all.

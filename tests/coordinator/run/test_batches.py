@@ -1,5 +1,6 @@
 """Submitted batches without a transport: parts in any order, ids, bounds, restarts anywhere, cancels.
-Tests external_generations.py, common/protocol/batches.py and coordinator/storage/batch_records.py."""
+Tests external_generations.py, common/protocol/batches.py, common/runs/journal/candidate_counts.py and
+coordinator/storage/batch_records.py."""
 
 import hashlib
 from dataclasses import replace
@@ -9,8 +10,11 @@ import pytest
 
 from dreamfleet.common.protocol.batches import MAX_BATCH, BatchError, BatchHeader, pack_batch
 from dreamfleet.common.protocol.messages import MAX_PART
+from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.run import batches as batches_module
+from dreamfleet.coordinator.run.recall import recall
 from dreamfleet.coordinator.run.shown_state import shown_state
+from dreamfleet.coordinator.storage.verification_records import StoredBar
 from tests.support.batch_door import SETTINGS, SIZE, Door, vectors
 
 
@@ -23,7 +27,7 @@ def test_a_batch_waits_is_scored_and_is_read(door):
     assert shown_state(door.run).word == "waiting for workers"
     reply = door.submit("a")
     assert (reply.state, reply.is_new, reply.population, reply.episodes) == ("waiting", True, 2, 2)
-    door.step()
+    door.go_on()
     assert door.query("read", id="a").state == "running"
     door.work(3)
     reply = door.query("read", id="a")
@@ -40,7 +44,7 @@ def test_a_batch_waits_is_scored_and_is_read(door):
 def test_batches_are_listed_open_ones_first(door):
     for each in "abcd":
         door.submit(each, first=ord(each))
-    door.step()
+    door.go_on()
     assert door.run.journal.batches.open_count() == 4
     door.work()
     door.query("cancel", id="c")
@@ -55,7 +59,7 @@ def test_parts_arrive_in_any_order_and_again(door):
     assert len(order) > 1
     reply = door.send(header, body, [order[-1], *order[:-1][::-1], order[0]])
     assert reply.state == "waiting"
-    door.step()
+    door.go_on()
     assert [len(each.vector) for each in door.run.generation.missing] == [4 * SIZE] * 2000
     damaged, wrong = pack_batch("damaged", vectors(1), [1])
     assert door.send(damaged, wrong[:-1] + b"\x7f").refused == "malformed"
@@ -87,7 +91,7 @@ def test_what_waits_is_bounded(door, monkeypatch):
     door.batches.tick(door.now)
     monkeypatch.setattr(batches_module, "MAX_WAITING", 3)
     door.submit("open")
-    door.step()
+    door.go_on()
     assert [door.submit(f"w{each}").refused for each in range(4)] == ["", "", "", "busy"]
     assert door.submit("w0").state == "waiting"  # known ones are found all the same
     with pytest.raises(BatchError):
@@ -97,7 +101,7 @@ def test_what_waits_is_bounded(door, monkeypatch):
 def test_a_job_of_two_batches_is_scored_once(door):
     door.submit("a")
     door.submit("b", count=3, seeds=(2, 3))  # shares two jobs with it
-    door.step()
+    door.go_on()
     door.work()
     door.work()
     assert len(door.scored) == len(set(door.scored)) == 4 + 4
@@ -109,7 +113,7 @@ def test_a_job_of_two_batches_is_scored_once(door):
 def test_a_restart_anywhere_loses_no_batch_and_no_score(door, done):
     door.submit("a", count=2)
     door.submit("b", count=2, first=9.0)
-    door.step()
+    door.go_on()
     for _ in range(done):
         door.work(1)
     door.submit("c")
@@ -129,14 +133,14 @@ def test_a_cancelled_batch_keeps_its_scores(door, is_killed):
     door.submit("a", count=3)
     door.submit("b")
     door.submit("c", first=5.0)
-    door.step()
+    door.go_on()
     door.work(2)
     assert door.query("cancel", id="b").state == "cancelled"
     assert door.query("cancel", id="a").state == "cancelled"
     if is_killed:
         door.run.commit()
         door.restart()
-    door.step()
+    door.go_on()
     reply = door.query("read", id="a")
     assert (reply.done, reply.fitness[1:]) == (3, (None, None))
     assert [(each.candidate, each.error) for each in reply.errors] == [(1, "cancelled"), (2, "cancelled")]
@@ -151,3 +155,25 @@ def test_fresh_seeds_differ_from_batch_to_batch(door):
     assert [each.episodes for each in replies] == [3, 3, SETTINGS.episodes]
     seeds = [door.journal.batches.find(each).seeds for each in "abc"]
     assert len({each for some in seeds for each in some}) == 8
+
+
+def test_batches_of_others_share_results_and_keep_them_after_a_recall(door):
+    door.submit("one", 2, seeds=(1, 2))
+    door.submit("again", 3, seeds=(1, 2, 2))
+    door.submit("cut", 3, seeds=(5, 6))
+    for _ in range(2):
+        door.go_on()
+        door.work()
+    door.go_on()
+    door.work(3)
+    door.query("cancel", id="cut")
+    door.go_on()
+    with RunFolder(door.path) as run:
+        before = run.candidates(), [each.steps for each in run.history()]
+        assert [each.episodes for each in before[0]] == [2, 2, 3, 3, 3, 2, 0, 0]
+        assert [sum(each.steps for each in before[0] if each.generation == number) for number in range(3)] == before[1]
+    door.journal.verification.bar("a", StoredBar("a test"), 1)
+    recall(door.journal, SETTINGS, {"a"})
+    door.journal.commit()
+    with RunFolder(door.path) as run:
+        assert (run.candidates(), [each.steps for each in run.history()]) == before

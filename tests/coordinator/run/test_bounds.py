@@ -27,6 +27,7 @@ from dreamfleet.coordinator.optimisers.api import Search
 from dreamfleet.coordinator.optimisers.evolution import Evolution
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.service.status import encode_part
+from tests.support.dispatched import result
 from tests.support.failures import failure
 from tests.support.run_bench import SETTINGS, A, Bench
 from tests.support.samples import SPEC
@@ -45,10 +46,10 @@ def bench(make_bench):
 
 
 def deliver_all(bench, numbers=FINE, kinds=("score", "evaluate", "collect")):
-    given = [(send.identity, work.job) for send in bench.run.fleet.dispatch(bench.now) for work in send.work]
-    for name, job in given:
+    fetched = bench.fetch()
+    for name, job in fetched:
         bench.deliver(name, Result(job.digest, *(numbers if job.kind in kinds else FINE), None, None))
-    return given
+    return fetched
 
 
 def answers_of(bench):
@@ -106,10 +107,9 @@ def test_huge_counts_of_slots_and_steps_can_be_encoded(bench):
 
 def test_an_error_with_too_many_steps_is_an_error(bench):
     for _ in range(3):
-        send = next(each for each in bench.run.fleet.dispatch(bench.now) if each.work)
-        digest = send.work[0].digest
-        bench.deliver(send.identity, Result(digest, None, MAX_COUNT, 0.1, failure("boom"), None))
-        assert bench.run.fleet.jobs[digest].attempts[-1].error == failure("boom")
+        (name, job), *_ = bench.fetch()
+        bench.deliver(name, result(job.digest, error=failure("boom"), steps=MAX_COUNT))
+        assert bench.run.fleet.jobs[job.digest].attempts[-1].error == failure("boom")
         answers_of(bench)
     assert bench.run.fleet.counts["errors"] == 3
 

@@ -10,14 +10,15 @@ from dataclasses import replace
 import pytest
 
 from dreamfleet.common.protocol.failures import Failure
-from dreamfleet.common.protocol.messages import Result, ResultBatch
 from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, training_seed
 from dreamfleet.coordinator.jobs import generation
+from dreamfleet.coordinator.run.recall import recall
 from dreamfleet.coordinator.run.run import BY_HAND
 from dreamfleet.coordinator.run.shown_state import shown_state
 from dreamfleet.coordinator.settings.limits import LimitsConfig
+from tests.support.dispatched import result
 from tests.support.failing_runs import GENERATIONS, SETTINGS, Failing, by_vector, pause_kinds
 from tests.support.failures import failure
 from tests.support.run_bench import A, B
@@ -35,7 +36,7 @@ def break_others(bench):
     """Every host but a fails whatever it is given from now on."""
     answer, error = bench.answer_one, failure("OSError", "sick")
     bench.answer_one = lambda name, job: (
-        answer(name, job) if name == A else bench.deliver(name, Result(job.digest, None, 0, 0.1, error, None))
+        answer(name, job) if name == A else bench.deliver(name, result(job.digest, error=error, steps=0))
     )
 
 
@@ -170,14 +171,6 @@ def test_redraws_count_each_candidate_once_and_go_on_where_all_failed(begin):
     assert bench.run.history.rows[0].failed <= 6
 
 
-def test_racing_with_failures_is_the_same_through_restarts(failing, begin):
-    settings = replace(SETTINGS, racing=True, episodes=4, population=8)
-    fails = by_vector(0.1)
-    whole = failing(settings=settings, fails=fails).story()
-    assert sum(each.failed for each in whole[0])
-    assert killed(begin(fails, settings), 14) == whole
-
-
 def test_a_host_that_never_scored_condemns_nobody(begin):
     bench = begin()
     break_others(bench)
@@ -200,7 +193,7 @@ def left(begin):
 def replace_host(bench):
     bench.wait()
     bench.hosts = [NEW]
-    bench.run.admission.admit(bench.request(NEW), bench.now)
+    bench.admit(NEW)
     bench.serve()
 
 
@@ -223,8 +216,7 @@ def test_a_failing_job_goes_to_the_host_where_it_failed_least(left):
     """A new host that joins before the one that has scored gets no proof: both are here, and one is known."""
     left.wait()
     left.hosts = [NEW, A]
-    for name in left.hosts:
-        left.run.admission.admit(left.request(name), left.now)
+    left.admit(NEW, A)
     left.serve()
     assert failed(left) == [2] * GENERATIONS
 
@@ -244,8 +236,8 @@ def test_a_host_that_has_scored_ends_the_pause_of_a_fleet_that_cannot(left):
     left.fails = sound
     break_others(left)
     left.hosts = [NEW, A]
-    left.run.admission.admit(left.request(A), left.now)
-    left.handle_heartbeat(A, host_class=left.host_class)
+    left.admit(A)
+    left.handle_heartbeat(A)
     left.run.advance(left.now)
     assert left.run.state.paused is None
     left.serve()
@@ -295,7 +287,7 @@ def test_time_without_workers_or_paused_is_no_time_of_the_run(begin):
     assert bench.run.open_seconds == 0.0
     bench.run.resume()
     for name in (A, B):
-        bench.handle_heartbeat(name, host_class=bench.host_class)
+        bench.handle_heartbeat(name)
     bench.wait()
     assert bench.run.open_seconds == 1.0
     bench.hosts = []
@@ -342,8 +334,8 @@ class Lethal(Failing):
         self.lives = itertools.count(16)
         super().begin()
 
-    def handle_heartbeat(self, name, **more):
-        super().handle_heartbeat(name, **more)
+    def handle_heartbeat(self, name):
+        super().handle_heartbeat(name)
         if not self.new_names:  # else each new host ends the pause
             self.run.advance(self.now)  # as the service does: the run sees the new life before it gets jobs
 
@@ -355,7 +347,7 @@ class Lethal(Failing):
             number = next(self.lives)
             life = f"pod{number}/{number:08x}" if self.new_names else f"{name.partition('/')[0]}/{number:08x}"
             self.hosts[self.hosts.index(name)] = life
-            self.run.admission.admit(self.request(life), self.now)
+            self.admit(life)
         else:
             super().answer_one(name, job)
 
@@ -409,8 +401,8 @@ def test_a_cut_link_is_no_end_of_a_worker(begin):
         bench.run.fleet.handle_departure(A, bench.now)
         bench.wait()
         assert any(each.lost_with for each in bench.run.fleet.jobs.values())
-        bench.run.admission.admit(bench.request(A), bench.now)
-        bench.handle_heartbeat(A, host_class=bench.host_class)
+        bench.admit(A)
+        bench.handle_heartbeat(A)
         assert not any(each.lost_with for each in bench.run.fleet.jobs.values())
     bench.serve()
     assert failed(bench) == [0] * GENERATIONS
@@ -442,14 +434,14 @@ def test_a_run_ends_though_a_suspect_failed_on_the_only_host_that_has_scored(beg
         is_first = job.candidate == 3 and job.generation == 0 and job.digest not in tried
         if is_first or (is_broken and name == B):
             tried.add(job.digest)
-            bench.deliver(name, Result(job.digest, None, 0, 0.1, failure("OSError", f"on {name}"), None))
+            bench.deliver(name, result(job.digest, error=failure("OSError", f"on {name}"), steps=0))
         else:
             answer(name, job)
 
     bench.answer_one = answer_one
     bench.serve(stop=lambda run: run.fleet.jobs.failures)
     bench.hosts = [A, B]
-    bench.run.admission.admit(bench.request(B), bench.now)
+    bench.admit(B)
     bench.serve()
     assert failed(bench) == [0] * GENERATIONS
 
@@ -466,11 +458,7 @@ def test_a_resume_in_the_second_half_of_a_race_wants_the_first_half_before(begin
 class Quiet(Failing):
     """A bench in which all answers of a turn arrive before the run goes on."""
 
-    def deliver(self, name, result):
-        batch = ResultBatch(
-            run_uid=self.run.uid, incarnation=1, fingerprint="f", results=(result,), host_class=self.host_class
-        )
-        self.worker_protocol.handle_results(name, batch, self.now)
+    deliver = Failing.send
 
 
 def test_where_all_that_was_made_has_failed_the_rest_of_the_generation_goes_on(begin, monkeypatch):
@@ -481,3 +469,51 @@ def test_where_all_that_was_made_has_failed_the_rest_of_the_generation_goes_on(b
         bench.serve()
         stories.append(bench.story())
     assert stories[0] == stories[1]
+
+
+# R8: only suspects are open, and no scored job is left that could show whether a new host can score.
+
+
+def serve_alone(bench, name, until):
+    """Let one host score until a generation is open; the other is gone."""
+    for other in [each for each in bench.run.fleet.members if each != name]:
+        bench.run.fleet.remove_worker(other)
+    bench.hosts = [name]
+    bench.admit(name)
+    bench.serve(stop=lambda run: run.generation.number == until)
+
+
+@pytest.fixture
+def unproven(begin):
+    """The host of generation 0 lost two workers with all jobs of generation 1, whose former scores were recalled."""
+    settings = replace(SETTINGS, population=2, episodes=1)
+    bench = begin(settings=settings)
+    serve_alone(bench, A, 1)
+    serve_alone(bench, B, 2)
+    recall(bench.journal, settings, {"b"})
+    bench.journal.commit()
+    bench.restart()
+    bench.run.fleet.remove_worker(B)
+    for life in (A, "a/00000009"):
+        bench.admit(life)
+        bench.handle_heartbeat(life)
+        assert len(bench.fetch()) == 2
+        bench.run.fleet.handle_departure(life, bench.now)
+        bench.wait()
+        bench.run.advance(bench.now)
+    assert all(each.is_suspect for each in bench.run.fleet.jobs.values())
+    bench.hosts = [NEW]
+    bench.admit(NEW)
+    return bench
+
+
+def test_a_new_host_gets_the_suspects_when_the_only_host_that_has_scored_is_gone(unproven):
+    unproven.serve()
+    assert failed(unproven) == [0, 0, 0]
+
+
+def test_a_new_host_that_fails_them_all_pauses_the_run(unproven):
+    unproven.fails = lambda job: True
+    unproven.serve()
+    assert pause_kinds(unproven) == [PauseKind.NO_ABLE_HOST]
+    assert unproven.run.generation.failed == []

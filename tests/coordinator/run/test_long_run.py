@@ -7,9 +7,9 @@ from time import process_time
 import numpy as np
 import pytest
 
-from dreamfleet.common.protocol.messages import Result
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.service.status import encode_status
+from tests.support.dispatched import result
 from tests.support.run_bench import SETTINGS, A, B, Bench
 
 BLOCK, BLOCKS = 250, 400  # generations of a measurement, and how many there are
@@ -27,7 +27,7 @@ class LongRun(Bench):
                 self.handle_heartbeat(name)
             for send in self.run.fleet.dispatch(self.now):
                 for work in send.work:
-                    self.deliver(send.identity, Result(work.job.digest, score(work), 10, 0.1, None, None))
+                    self.deliver(send.identity, result(work.digest, score(work)))
         encode_status(take_snapshot(self.run, "long", {}, self.now, self.now))
         self.run.take_notes()
         return process_time() - begun

@@ -11,7 +11,6 @@ import pytest
 
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import DamagedJournalError, JournalError, NotWritableNowError, UsageError
-from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL
 from dreamfleet.common.runs.stages import StageTracker, stages_of
@@ -23,6 +22,7 @@ from dreamfleet.coordinator.run.recall import bar_stored, recall
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.support import run_bench
+from tests.support.dispatched import result
 from tests.support.failing_runs import GENERATIONS, SETTINGS, Failing
 from tests.support.run_bench import A, B, Bench, result_of
 
@@ -67,8 +67,7 @@ class Lying(Failing):
 
     def answer_one(self, name, job):
         lie = 100.0 if name == A and job.kind == "score" and job.candidate < 3 and job.episode < 2 else 0.0
-        fitness = int.from_bytes(job.digest[:3]) / 1e6 + lie
-        self.deliver(name, Result(job.digest, fitness, 10, 0.1, None, None))
+        self.deliver(name, result(job.digest, self.fitness_of(job) + lie))
 
 
 RACE = replace(SETTINGS, episodes=4, racing=True)
@@ -91,8 +90,7 @@ def bar(bench, host, others):
     bench.run.commit()
     bench.hosts = others
     bench.restart()
-    for name in others:
-        bench.run.admission.admit(bench.request(name), bench.now)
+    bench.admit(*others)
     bench.serve()
     assert bench.run.state.ended
 
@@ -171,15 +169,6 @@ def test_a_replayed_strategy_asks_for_what_the_stored_one_asks_for(ended, optimi
         np.testing.assert_array_equal(*asked)
 
 
-def test_a_run_of_which_all_is_recalled_comes_to_the_same(ended):
-    bench = ended()
-    before = outcome(bench)
-    recall(bench.journal, bench.settings, {"a"})
-    assert bench.journal.last_generation().number == 0
-    live_on(bench)
-    assert outcome(bench) == before
-
-
 def test_candidates_that_were_drawn_anew_are_drawn_anew_again(ended):
     fails = lambda job: job.kind == "score" and job.digest[0] % 8 == 0  # noqa: E731
     bench = ended(replace(CMA, on_failure="redraw"), fails=fails)
@@ -206,6 +195,7 @@ def test_what_a_host_brought_to_dropped_generations_counts_no_more_once_it_is_ba
     before = outcome(bench)
     for host in ("a", "b"):
         recall(bench.journal, bench.settings, {host})
+    assert bench.journal.last_generation().number == 0
     assert set(bench.journal.read("SELECT because FROM recalled")) == {("barred",)}
     live_on(bench)
     assert not bench.journal.read("SELECT 1 FROM result WHERE incarnation = 1")
@@ -275,12 +265,8 @@ def test_a_reported_controller_is_withdrawn_before_its_recall_is_durable_and_a_l
     bench = ended()
     path = bench.path / CONTROLLER
     before = Controller.load(path)
-
-    def killed(self):
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patched:
-        patched.setattr(Journal, "commit", killed)
+        patched.setattr(Journal, "commit", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             bench.run.bar("a")
     assert not path.exists()
@@ -309,12 +295,8 @@ def test_a_life_without_a_closed_generation_has_no_reported_controller(begin):
 def test_a_bar_that_is_killed_leaves_a_run_without_a_controller_or_all_of_the_recall(ended, monkeypatch):
     bench = ended()
     bench.journal.close()
-
-    def killed(self):
-        raise KeyboardInterrupt
-
     with monkeypatch.context() as patched:
-        patched.setattr(Journal, "commit", killed)
+        patched.setattr(Journal, "commit", Mock(side_effect=KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             bar_stored(bench.path, "a", is_barred=True)
     assert not (bench.path / CONTROLLER).exists()
@@ -359,12 +341,8 @@ def test_a_bar_on_a_full_disk_is_refused_and_changes_nothing(begin, monkeypatch)
     bench.run.commit()
     with RunFolder(bench.path) as run:
         before = run.history()
-
-    def full(self):
-        raise NotWritableNowError("the disk is full")
-
     with monkeypatch.context() as patched:
-        patched.setattr(Journal, "commit", full)
+        patched.setattr(Journal, "commit", Mock(side_effect=NotWritableNowError("the disk is full")))
         assert bench.run.bar("a")
         assert bench.run.state.stalled is not None
         assert not bench.run.commit()

@@ -37,7 +37,8 @@ def test_a_mean_without_evaluation_is_saved_at_once_at_intervals_and_as_the_coor
 def test_after_every_evaluation_the_file_holds_the_best_evaluated_mean(make):
     bench = make()
     bench.close(2)
-    assert (bench.saved().provenance["generation"], bench.saved().provenance["validation_mean"]) == (1, 10.0)
+    named = ("generation", "confirmed", "validation_mean", "validation_episodes")
+    assert [bench.saved().provenance[each] for each in named] == [1, False, 10.0, 2]
     bench.now += SAVE_INTERVAL
     bench.close(4)
     assert bench.saved().provenance["generation"] == 1

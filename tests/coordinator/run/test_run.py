@@ -5,13 +5,13 @@ from dataclasses import replace
 import msgspec
 import pytest
 
-from dreamfleet.common.protocol.messages import Result, ResultBatch
 from dreamfleet.common.protocol.stop_kind import PauseKind, StopKind
 from dreamfleet.common.runs.records import StoredEvaluation
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.rollout_collection import NOT_KEPT
 from dreamfleet.coordinator.settings.limits import LimitsConfig
+from tests.support.dispatched import result
 from tests.support.failures import failure
 from tests.support.run_bench import DRIVES, SETTINGS, A, B, Bench, drive_of, result_of
 
@@ -19,26 +19,6 @@ from tests.support.run_bench import DRIVES, SETTINGS, A, B, Bench, drive_of, res
 @pytest.fixture
 def bench(make_bench):
     return make_bench(Bench)
-
-
-def test_a_kill_between_dispatch_and_commit_loses_nothing(bench):
-    results = []
-    for send in bench.run.fleet.dispatch(bench.now):
-        for work in send.work:
-            results.append(Result(work.job.digest, float(work.job.candidate), 10, 0.1, None, None))
-            batch = ResultBatch(run_uid=bench.run.uid, incarnation=1, fingerprint="f", results=(results[-1],))
-            bench.worker_protocol.handle_results(send.identity, batch, bench.now)
-    assert bench.run.advance(bench.now)
-    early = bench.run.fleet.dispatch(bench.now, durable=False)
-    assert not any(send.verdicts for send in early)
-    opened = [work.vector for work in bench.run.generation.work]
-
-    bench.restart()
-    assert bench.run.generation.number == 0, "nothing was durable"
-    for result in results:  # without a verdict a worker repeats them
-        bench.deliver(A, result)
-    assert [work.vector for work in bench.run.generation.work] == opened
-    assert {digest for _, digest, verdict in bench.verdicts() if verdict == "accepted"} == {r.digest for r in results}
 
 
 def test_a_result_has_no_verdict_before_its_rollout_is_on_disk(bench):
@@ -58,17 +38,6 @@ def test_a_result_has_no_verdict_before_its_rollout_is_on_disk(bench):
     assert len(bench.run.background_jobs.rollout_collections.uploads) == 0
 
 
-def test_the_end_waits_for_every_rollout(bench):
-    jobs = bench.reach_collection()
-    for name, job in jobs:
-        assert bench.run.state.ended is None
-        for part in bench.parts(job):
-            bench.upload(name, part)
-        bench.deliver(name, result_of(job))
-    assert bench.run.state.ended.kind is StopKind.GENERATIONS
-    assert bench.kept() == [drive_of(job) for _, job in jobs]
-
-
 def test_upload_parts_of_a_job_that_was_not_given_are_dropped_and_counted(bench):
     (name, job), _ = bench.reach_collection()
     part = bench.parts(job)[0]
@@ -86,30 +55,13 @@ def test_a_collected_rollout_without_its_upload_is_an_error(bench):
     assert bench.run.fleet.jobs.failures[0].attempts[0].error == NOT_KEPT
 
 
-def test_a_restart_during_an_upload_repeats_it_and_keeps_finished_rollouts(bench):
-    (name, job), (_, other) = bench.reach_collection()
-    for part in bench.parts(job):
-        bench.upload(name, part)
-    bench.deliver(name, result_of(job))
-    bench.upload(name, bench.parts(other)[0])
-    bench.restart()
-    assert bench.run.background_jobs.rollout_collections.progress == (1, DRIVES)
-    bench.handle_heartbeat(B, unacked=[other.digest])  # it was driven in the last incarnation
-    for part in bench.parts(other):
-        bench.upload(B, part)
-    bench.deliver(B, result_of(other))
-    assert bench.run.state.ended is not None
-    assert bench.kept() == [drive_of(job), drive_of(other)]
-
-
 def test_a_pause_names_candidate_seed_every_worker_how_often_and_why(bench):
-    given = {send.identity: send.work for send in bench.run.fleet.dispatch(bench.now)}
-    work = given[A][0]
-    seed, name = work.job.seeds[0], f"candidate 0/{work.job.candidate}"
+    job = dict(bench.fetch())[A]
+    seed, name = job.seeds[0], f"candidate 0/{job.candidate}"
     for worker, error in ((A, "boom"), (B, "bang")):
         assert bench.run.state.paused is None
-        bench.run.fleet.dispatch(bench.now)
-        bench.deliver(worker, Result(work.job.digest, None, 0, 0.1, failure(error), None))
+        bench.fetch()
+        bench.deliver(worker, result(job.digest, error=failure(error)))
     (pause,) = bench.run.state.paused.pauses
     assert pause.kind is PauseKind.FAILED_JOB
     assert all(each in pause.text for each in (name, str(seed), A, B, "boom", "bang", "dreamfleet resume"))

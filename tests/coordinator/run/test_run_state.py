@@ -2,7 +2,6 @@
 
 import re
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -80,10 +79,3 @@ def test_resume_ends_all_pauses_and_only_the_latest_waits_for_a_host(pauses):
             assert paused.paused.until_host == each.until_host
         assert paused.pauses == tuple(reversed(pauses))
         assert paused.resume() == state
-
-
-def test_a_run_ends_only_after_a_limit():
-    for state in (Running(), Paused((PAUSES[0],), Running()), Running().stall("", 0.0)):
-        with pytest.raises(InternalError):
-            state.end()
-    assert Paused((PAUSES[0],), Ending(LIMIT)).end().ended == LIMIT

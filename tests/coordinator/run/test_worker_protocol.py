@@ -3,9 +3,10 @@
 import pytest
 
 from dreamfleet.common.errors import InternalError
-from dreamfleet.common.protocol.messages import Result, ResultBatch
+from dreamfleet.common.protocol.messages import ResultBatch
 from dreamfleet.common.schema.validation import MAX_TEXT
 from dreamfleet.coordinator.dispatch.refusals import Refusal
+from tests.support.dispatched import result
 from tests.support.run_bench import B, Bench
 
 
@@ -18,34 +19,25 @@ def given_jobs(bench):
     """Jobs, all given to one worker."""
     bench.run.fleet.handle_departure(B, bench.now)
     bench.wait()
-    return [(send.identity, work.job) for send in bench.run.fleet.dispatch(bench.now) for work in send.work]
-
-
-def scored(job):
-    return Result(job.digest, 1.0, 10, 0.1, None, None)
-
-
-def send(bench, worker, *results):
-    batch = ResultBatch(run_uid=bench.run.uid, incarnation=1, fingerprint="f", results=results)
-    bench.worker_protocol.handle_results(worker, batch, bench.now)
+    return bench.fetch()
 
 
 def test_an_exception_before_a_result_counts_loses_no_other_result(bench, monkeypatch):
     (worker, first), (_, second) = given_jobs(bench)
     judge = bench.run.fleet.handle_result
 
-    def stumble(identity, result, now, host_class):
-        if result.digest == first.digest:
+    def stumble(identity, given, now, host_class):
+        if given.digest == first.digest:
             raise ZeroDivisionError
-        return judge(identity, result, now, host_class)
+        return judge(identity, given, now, host_class)
 
     monkeypatch.setattr(bench.run.fleet, "handle_result", stumble)
     with pytest.raises(ZeroDivisionError):
-        send(bench, worker, scored(first), scored(second))
+        bench.send(worker, result(first.digest), result(second.digest))
     assert first.digest in bench.run.fleet.jobs, "its worker repeats it"
     assert second.digest not in bench.run.fleet.jobs
     monkeypatch.undo()
-    send(bench, worker, scored(first), scored(second))
+    bench.send(worker, result(first.digest), result(second.digest))
     assert bench.run.generation.complete
 
 
@@ -54,9 +46,9 @@ def test_an_exception_while_a_result_is_counted_ends_the_incarnation_and_the_nex
 
     monkeypatch.setattr(bench.run.generation, "record", lambda *_: 1 / 0)
     with pytest.raises(InternalError, match=r"ZeroDivisionError.*--resume"):
-        send(bench, worker, scored(first))
+        bench.send(worker, result(first.digest))
     bench.restart()
-    send(bench, worker, scored(first), scored(second))
+    bench.send(worker, result(first.digest), result(second.digest))
     assert bench.run.generation.complete
 
 
@@ -73,7 +65,7 @@ def test_a_malformed_hello_is_refused_and_a_hello_with_a_known_reason_admits_nob
 
 def test_a_message_for_another_run_is_dropped(bench):
     (worker, job), _ = given_jobs(bench)
-    batch = ResultBatch(run_uid="0" * 32, incarnation=1, fingerprint="f", results=(scored(job),))
+    batch = ResultBatch(run_uid="0" * 32, incarnation=1, fingerprint="f", results=(result(job.digest),))
     bench.worker_protocol.handle(worker, batch, bench.now)
     assert bench.run.dropped == {"foreign run": 1}
     assert job.digest in bench.run.fleet.jobs

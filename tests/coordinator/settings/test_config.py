@@ -255,9 +255,10 @@ def test_a_task_that_describes_itself_needs_no_bundle(random_bundle):
     config = RunConfig(task=f"{__name__}:Field")
     assert config.needs_no_bundle
     assert freeze(config, None).task.bundle == ""
-    assert not RunConfig().needs_no_bundle
-    assert not RunConfig(task="dream").needs_no_bundle
-    assert not RunConfig(task="no.such.module:Task", bundle="tiny").needs_no_bundle
+    assert RunConfig(task="takecover").needs_no_bundle
+    named = [{"task": "takecover", "bundle": "b.zip"}, {"task": "no.such.module:Task", "bundle": "tiny"}]
+    for flags in ({}, {"task": "dream"}, {"task": "car-racing"}, *named):
+        assert not RunConfig(**flags).needs_no_bundle
     for unknown, names in {"moon": "'moon'", "no.such.module:Task": "--trust"}.items():
         with pytest.raises(UsageError, match=f"{names}.*--bundle"):
             _ = RunConfig(task=unknown).needs_no_bundle

@@ -1,6 +1,7 @@
 """What a run keeps of how it was served."""
 
 import json
+from contextlib import closing
 
 import pytest
 
@@ -30,11 +31,10 @@ def folder(tmp_path, random_bundle):
 
 
 def keep(folder, facts):
-    journal = Journal(folder / "journal.sqlite")
-    for name, text in facts.items():
-        journal.set_fact(name, text)
-    journal.commit()
-    journal.close()
+    with closing(Journal(folder / "journal.sqlite")) as journal:
+        for each in facts.items():
+            journal.set_fact(*each)
+        journal.commit()
 
 
 def test_limits_and_network_come_back_as_they_were_and_defaults_are_not_written(folder):

@@ -10,7 +10,6 @@ import pytest
 
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError, UsageError
-from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.effort import START_EFFORT, Effort
 from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.common.runs.run_paths import CONTROLLER
@@ -23,6 +22,7 @@ from dreamfleet.coordinator.settings.resume_settings import serving_facts
 from dreamfleet.coordinator.settings.start import StartPoint, find_start
 from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.experiments.rerun import Rerun
+from tests.support.dispatched import result
 from tests.support.reporting_runs import EVALUATED, Reporting
 
 
@@ -39,8 +39,7 @@ class Spending(Reporting):
         super().begin()
 
     def end(self):
-        while self.run.state.ended is None:
-            self.step()
+        super().end()
         return Controller.load(self.path / CONTROLLER)
 
 
@@ -67,10 +66,9 @@ def test_it_holds_generations_effort_fingerprint_versions_and_seeds(make):
 def test_effort_is_counted_on_once_a_result_as_it_would_be_summed_up(make):
     bench = make()
     before = bench.journal.results.effort
-    bench.given += [work.job for send in bench.run.fleet.dispatch(bench.now) for work in send.work]
-    job = bench.given[0]
+    (_, job), *_ = bench.fetch()
     bench.step()
-    bench.answer(Result(job.digest, 1.0, 10, 0.1, None, None))
+    bench.answer(result(job.digest))
     assert bench.journal.results.effort == before + Effort(10, 0, 0, 100_000)
     again = Journal(bench.path / "journal.sqlite")
     assert again.results.effort == bench.journal.results.effort

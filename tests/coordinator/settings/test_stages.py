@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.records import StageSettings
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages
@@ -16,11 +15,12 @@ from dreamfleet.coordinator.optimisers.evolution import Evolution
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.settings.fork import Fork
 from dreamfleet.coordinator.settings.limits import LimitsConfig
-from tests.coordinator.evaluated import EVERY, Evaluated
-from tests.support.run_bench import SETTINGS
+from tests.support.dispatched import result
+from tests.support.run_bench import SETTINGS, Bench
 from tests.support.samples import SPEC
 
 GENERATIONS = 11
+EVERY = 2  # generations from one evaluation to the next
 STAGES = (
     StageSettings(2),
     StageSettings(score=500.0, horizon=400, patience=0, episodes=2, racing=True),
@@ -33,8 +33,28 @@ BEGUN = [0, 2, 8, 10]  # the score of generation 5's mean counts from generation
 SIZES = [6] * 8 + [8] * 4
 
 
-class Staged(Evaluated):
-    reality = REALITY
+class Staged(Bench):
+    """Its means after generations 1, 3, 5, ... have the scores of `REALITY`; jobs are finished in any order."""
+
+    def fitness_of(self, job):
+        if job.kind == "score":
+            return int.from_bytes(job.digest[:4], "little") / 1e6
+        if job.generation % EVERY:
+            return REALITY[job.generation // EVERY] + job.episode
+        return 900.0  # of a mean that is evaluated because a limit was reached
+
+    def first(self, kind):
+        return next((index for index, job in enumerate(self.given) if job.kind == kind), None)
+
+    def end(self, after=lambda: None):
+        """What the scored jobs name of their specification, by generation."""
+        found = {}
+        while self.run.state.ended is None:
+            self.fetch()
+            found.update({job.generation: job.overrides for job in self.given if job.kind == "score"})
+            self.finish()
+            after()
+        return found
 
     def outcome(self):
         with RunFolder(self.path) as run:
@@ -53,7 +73,7 @@ def staged(make_bench):
 @pytest.fixture
 def undisturbed(staged):
     bench = staged()
-    named = bench.drive(lambda _: 0)
+    named = bench.end()
     assert list(named.values()) == [(None, None, None)] * 2 + [(400, 0, None)] * 6 + [(600, 0, None)] * 3
     *_, begun = bench.outcome()
     assert [each.since for each in begun] == BEGUN
@@ -64,7 +84,7 @@ def undisturbed(staged):
 def test_killed_as_each_generation_opens_every_optimiser_gives_the_same_bits(staged, optimiser):
     settings = replace(STAGED, optimiser=optimiser)
     calm, killed = staged(settings=settings), staged(settings=settings)
-    calm.drive(lambda _: 0)
+    calm.end()
     drive_with_kills(killed)
     assert killed.outcome() == calm.outcome()
 
@@ -73,8 +93,7 @@ def drive_with_kills(bench):
     """To its end, while its coordinator is killed as each generation opens."""
     while bench.run.state.ended is None:
         before = bench.run.generation.number
-        bench.fetch()
-        bench.finish(0)
+        bench.step()
         if bench.run.generation.number > before and bench.run.state.ended is None:
             bench.restart()
             assert bench.run.generation.number == before + 1
@@ -82,10 +101,10 @@ def drive_with_kills(bench):
 
 def test_a_run_that_ended_between_two_checks_and_goes_on_comes_to_the_same_stages(staged, undisturbed):
     bench = staged(generations=5)
-    bench.drive(lambda _: 0)
+    bench.end()
     bench.limits = LimitsConfig(generations=GENERATIONS)
     bench.restart()
-    bench.drive(lambda _: 0)
+    bench.end()
     assert bench.outcome() == undisturbed
 
 
@@ -107,7 +126,7 @@ def test_a_restart_begins_at_the_first_mean_and_what_follows_at_the_best_also_af
     again = StageSettings(3, score=1e6, restart=True)
     settings = replace(STAGED, stages=(StageSettings(3, score=1e6), again, again, StageSettings(sigma0=0.05)))
     calm, killed = staged(settings=settings), staged(settings=settings)
-    calm.drive(lambda _: 0)
+    calm.end()
     found = populations(calm)
     with RunFolder(calm.path) as run:
         begun = begun_stages(run.settings, run.history(), run.evaluations())
@@ -128,7 +147,7 @@ def populations(bench):
 
 def test_the_log_says_when_a_stage_begins_and_why(staged):
     bench = staged()
-    bench.drive(lambda _: 0)
+    bench.end()
     said = [note.text for note in bench.run.take_notes() if note.what in ("stage", "next stage")]
     for note, data in zip(said, ("1 of 4 .*1,000", "2 of 4 .*2", "3 of 4 .*5 .*510.5", "4 of 4 .*240"), strict=True):
         assert re.search(data, note)
@@ -136,24 +155,11 @@ def test_the_log_says_when_a_stage_begins_and_why(staged):
 
 def test_the_status_says_which_stage_it_is_and_what_counts_there(staged):
     bench, found = staged(), []
-    bench.drive(lambda _: 0, lambda: found.append(take_snapshot(bench.run, "night", {}, 0.0, 0.0).status))
+    bench.end(lambda: found.append(take_snapshot(bench.run, "night", {}, 0.0, 0.0).status))
     seen = {(each.generation.stage.number, each.generation.stage.since) for each in found}
     assert seen == {(number, since) for number, since in enumerate(BEGUN, 1)}
     stage = found[-1].generation.stage
     assert (stage.total, stage.horizon, stage.patience, stage.population, stage.episodes) == (4, 600, 0, 8, 2)
-
-
-def test_a_search_that_begins_anew_begins_at_the_mean_and_draws_other_numbers(staged):
-    bench = staged(settings=replace(STAGED, stages=(StageSettings(1), StageSettings(sigma0=0.1))))
-    first = bench.run.generation
-    while bench.run.generation.number == 0:
-        bench.fetch()
-        bench.finish(0)
-    before = bench.run.generations.mean
-    assert bench.run.generations.sigma == 0.1
-    assert {work.vector for work in first.work}.isdisjoint(work.vector for work in bench.run.generation.work)
-    bench.restart()
-    assert bench.run.generations.mean == before
 
 
 def test_a_kept_drive_is_driven_as_the_candidates_of_its_generation(staged):
@@ -163,7 +169,7 @@ def test_a_kept_drive_is_driven_as_the_candidates_of_its_generation(staged):
         bench.fetch()
         lives[0].update({job.generation: job for job in bench.given if job.kind == "collect"})
         bench.given = [job for job in bench.given if job.kind != "collect"]
-        bench.finish(0)
+        bench.finish()
     bench.restart()
     bench.fetch()
     lives[1].update({job.generation: job for job in bench.given if job.kind == "collect"})
@@ -176,11 +182,10 @@ def test_a_kept_drive_is_driven_as_the_candidates_of_its_generation(staged):
 def test_a_result_is_bounded_by_the_horizon_of_its_own_stage(staged):
     bench = staged(settings=replace(STAGED, stages=(StageSettings(1), StageSettings(horizon=2000))))
     while bench.run.generation.number == 0:
-        bench.fetch()
-        bench.finish(0)
+        bench.step()
     bench.fetch()
     job = bench.given[bench.first("score")]
-    bench.answer(Result(job.digest, 1.0, 1500 * 1024, 0.1, None, None))
+    bench.answer(result(job.digest, steps=1500 * 1024))
     assert bench.run.generation.done == 1
 
 
@@ -190,11 +195,11 @@ def forked(bench, given=frozenset()):
 
 def test_a_fork_begins_with_the_stage_that_its_run_is_in_and_goes_on_with_the_others_if_there_are_any(staged):
     ended = staged()
-    ended.drive(lambda _: 0)
+    ended.end()
     settings = forked(ended)
     assert (settings["stages"], settings["horizon"], settings["population"]) == ((), 600, 8)
     bench = staged(generations=4)
-    bench.drive(lambda _: 0)
+    bench.end()
     with RunFolder(bench.path) as run:
         assert run.stage_at(4).stage.number == 2
     settings = forked(bench)
@@ -208,7 +213,7 @@ def test_a_run_among_several_searches_is_forked_only_with_a_schedule(staged, gen
     ends = StageSettings(3, score=1e6)
     stages = (ends, replace(ends, restart=True), StageSettings(sigma0=0.05))
     bench = staged(generations=generations, settings=replace(STAGED, stages=stages))
-    bench.drive(lambda _: 0)
+    bench.end()
     with pytest.raises(UsageError, match="--schedule"):
         forked(bench)
     assert forked(bench, {"schedule"})

@@ -62,12 +62,6 @@ def test_controllers_have_the_outputs_of_the_world(tmp_path, world, actions):
     assert settings_of(bundle, task="dream", features="z").controller == ControllerShape(3, actions)
 
 
-def test_a_task_that_ships_and_needs_no_world_model_gets_none_by_default():
-    assert RunConfig(task="takecover").needs_no_bundle
-    for other in ({"task": "car-racing"}, {"task": "dream"}, {}, {"task": "takecover", "bundle": "b.zip"}):
-        assert not RunConfig(**other).needs_no_bundle
-
-
 @pytest.mark.parametrize("task", ["takecover", "gym:CartPole-v1"])
 def test_a_world_model_of_another_world_is_refused(bundle, random_bundle, task):
     for each, world in ((bundle, ABSENT), (random_bundle, "car-racing")):

@@ -1,21 +1,18 @@
 """What a journal's checksums find beside changed bits: rows that are lost, exchanged or not of its version.
 Tests checksum_records.py and common/runs/journal/checksums.py."""
 
-import sqlite3
-from contextlib import closing
 from dataclasses import replace
 
 import pytest
 
 from dreamfleet.common.errors import DamagedJournalError
-from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.coordinator.settings.fork import Fork
 from dreamfleet.coordinator.settings.start import find_start
 from dreamfleet.coordinator.storage import recall_records
 from tests.support.batch_door import Door
 from tests.support.failing_runs import SETTINGS, Failing
+from tests.support.journals import change_journal
 
 ENDING = replace(SETTINGS, evaluate_every=1, evaluation_episodes=2)
 
@@ -25,10 +22,9 @@ class Scoring(Failing):
 
     largest = 1.0
 
-    def answer_one(self, name, job):
+    def fitness_of(self, job):
         sign = -1 if job.candidate % 2 else 1
-        fitness = sign * self.largest * (1 + job.candidate // 2 / 3) + 1e-3 * job.candidate
-        self.deliver(name, Result(job.digest, fitness, 10, 0.1, None, None))
+        return sign * self.largest * (1 + job.candidate // 2 / 3) + 1e-3 * job.candidate
 
 
 @pytest.fixture
@@ -53,9 +49,8 @@ def verify(folder):
 
 
 def edit(folder, *statements):
-    with closing(sqlite3.connect(folder / JOURNAL)) as connection, connection:
-        for each in statements:
-            connection.execute(each)
+    for each in statements:
+        change_journal(folder, each)
 
 
 REST = (
@@ -102,7 +97,7 @@ def door(tmp_path):
     made = Door(tmp_path / "search")
     for name, first in (("a", 0.0), ("b", 500.0)):
         made.submit(name, first=first)
-        made.step()
+        made.go_on()
         made.work()
     assert made.query("read", id="b").state == "complete"
     return made

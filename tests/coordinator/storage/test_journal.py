@@ -3,8 +3,6 @@ common/runs/records.py."""
 
 import os
 import shutil
-import sqlite3
-from contextlib import closing
 from functools import partial
 
 import numpy as np
@@ -17,6 +15,7 @@ from dreamfleet.common.protocol.messages import Result
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_lock import run_lock
+from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.coordinator.jobs.confirmation import Finalist
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.generation import Generation
@@ -26,6 +25,7 @@ from dreamfleet.coordinator.storage.journal_file import sqlite_side_files
 from dreamfleet.coordinator.storage.recall_records import REWOUND
 from dreamfleet.coordinator.storage.verification_records import UNCHECKED
 from tests.support.disks import read_only_view
+from tests.support.journals import change_journal
 from tests.support.samples import SPEC
 
 SETTINGS = RunSettings(SPEC, ControllerShape(1, 3), 2, 1, 0.1, "diagonal", 1, 5, 2)
@@ -62,9 +62,7 @@ def fill(journal):
 @pytest.mark.parametrize("candidate", [2, -1, 2**62])
 def test_a_candidate_that_was_drawn_anew_and_does_not_exist_is_damage(journal, folder, candidate):
     fill(journal)
-    with sqlite3.connect(folder / "journal.sqlite") as other:
-        other.execute("INSERT INTO redraw VALUES (1, 0, ?, x'00')", (candidate,))
-    other.close()
+    change_journal(folder, "INSERT INTO redraw VALUES (1, 0, ?, x'00')", candidate)
     with pytest.raises(DamagedJournalError):
         journal.last_generation()
 
@@ -130,29 +128,19 @@ def test_a_run_is_never_overwritten(folder, random_bundle):
         Journal.create(folder, SETTINGS, random_bundle.path)
 
 
-def change(path, statement):
-    with closing(sqlite3.connect(path)) as connection:
-        connection.execute(statement)
-
-
-def replace_by_foreign(path):
-    path.unlink()
-    change(path, "CREATE TABLE t (x)")
-
-
 @pytest.mark.parametrize(
     ("damage", "error"),
     [
-        (replace_by_foreign, JournalError),
-        (lambda path: path.write_text("this is no database, and long enough to be taken for one" * 20),
+        (lambda folder: ((folder / JOURNAL).unlink(), change_journal(folder, "CREATE TABLE t (x)")), JournalError),
+        (lambda folder: (folder / JOURNAL).write_text("this is no database, but as long as one" * 30),
          DamagedJournalError),
-        *((partial(change, statement=f"PRAGMA user_version = {number}"), JournalError)
+        *((partial(change_journal, statement=f"PRAGMA user_version = {number}"), JournalError)
           for number in (-5, 0, 1, 2, 8, 9, 99)),
     ],
 )  # fmt: skip
 def test_a_foreign_or_damaged_journal_is_refused_and_untouched(folder, damage, error):
-    path = folder / "journal.sqlite"
-    damage(path)
+    path = folder / JOURNAL
+    damage(folder)
     before = path.read_bytes()
     for opening in (Journal, lambda path: RunFolder(path.parent)):
         with pytest.raises(JournalError) as refused:

@@ -11,15 +11,74 @@ from tests.support.ledgers import entry
 from tests.support.phase_requests import requests
 
 ROUND_2 = (entry(1, "collect", episodes=620), entry(1, "bundle"), entry(1, "evolve"))
-DATA = Path("data")
+GATED = (*ROUND_2, entry(2, "bundle"))
+REFUSED = (*GATED, entry(2, "gate", kept=False))
+DATA, BEGUN = Path("data"), Path("data/rounds/00")
+FEW, MOVED, DRIVERS = Path("few.npz"), Path("moved.npz"), [Path("0.npz"), Path("1.npz")]
+FIRST_BUNDLE, SECOND_BUNDLE = "data/rounds/01/round-1.zip", "data/rounds/02/round-2.zip"
+FIRST_BEST = "data/runs/round-01/controller.npz"
+INIT = requests(
+    entry(0, "init", sha256="ab", controller="tiny"), init="tiny", vae="keep", mdnrnn_flags="--set done=true"
+)
+WITH_FLAGS = requests(*ROUND_2, bundle_flags="--reward value --end 0.3")
+UPDATES = requests(*ROUND_2, vae_flags="--updates 20", mdnrnn_flags="--updates 10", mdnrnn_updates=5)
+PONG = {"task": "gym:ALE/Pong-v5", "environment": ("mode=1",), "crop": "0:160,0:160", "skip": 4, "difference": True}
+GATE = requests(*GATED).gate(2)
+LIVES = requests(*GATED, task="takecover", gate_drives=0, gate_losses=0).gate(2)
+# Sentences that say why, what is asked, and what it must name.
+ASKED = [
+    ("the first round takes the preset's amounts", requests().collect(1),
+     {"data": DATA, "preset": "tiny", "settings": {"seed": 0}, "world": {}}),
+    ("and its flags", requests(vae_flags="--batch 50").train(1, "vae"),
+     {"data": DATA / "rounds/01", "preset": "tiny", "device": "cpu", "settings": {"batch": 50, "seed": 0},
+      "continue_from": None}),
+    ("later rounds add random drives", requests(*ROUND_2, more_drives=580, drive_steps=300, jobs=2).collect(2),
+     {"settings": {"seed": 0, "episodes": 1200, "steps": 300}, "jobs": 2}),
+    ("and own ones", requests(*ROUND_2, own_drives=80, noise=0.2, spells=0.01).drive(DRIVERS),
+     {"settings": {"seed": 0, "episodes": 700, "noise": 0.2, "spells": 0.01}, "controllers": ("0.npz", "1.npz")}),
+    ("and kept ones", requests(*ROUND_2).import_kept(2), {"data": DATA, "run": "round-01", "runs_dir": DATA / "runs"}),
+    *((f"training goes on from the model that counts: {vae}", requests(*REFUSED, vae=vae).train(3, "vae"),
+       {"settings": {"seed": 2, "updates": 1800}, "continue_from": DATA / "rounds/01/vae.safetensors",
+        "decoder_only": vae == "decoder"}) for vae in ("decoder", "whole")),
+    ("an MDN-RNN has no decoder", requests(*REFUSED, vae="decoder").train(3, "mdnrnn"), {"decoder_only": False}),
+    *((f"flags of bundle are of round {number} too", WITH_FLAGS.bundle(number),
+       {"out": DATA / f"rounds/0{number}/round-{number}.zip", "reward": "value", "end": "0.3"}) for number in (1, 2)),
+    *((f"so many updates among all rounds' flags count in round {number} too", UPDATES.train(number, model),
+       {"settings": {"seed": number - 1, "updates": updates}})
+      for model, both in (("vae", [20, 20]), ("mdnrnn", [10, 5])) for number, updates in enumerate(both, 1)),
+    ("with init the first round goes on as later ones do", INIT.train(1, "mdnrnn"),
+     {"settings": {"seed": 0, "updates": 600, "done": True}, "continue_from": BEGUN / "mdnrnn.safetensors"}),
+    ("a VAE that stays sees the drives too", INIT.train(1, "vae"), {"continue_from": BEGUN / "vae.safetensors"}),
+    ("with init the first round drives", INIT.drive(DRIVERS[:1]),
+     {"settings": {"seed": 0, "episodes": 80, "noise": 0.3}}),
+    ("and moves its controller", INIT.refit(1, MOVED),
+     {"controller": str(BEGUN / "controller.npz"), "to": FIRST_BUNDLE}),
+    ("and its model is measured", INIT.gate(1)["old"]["probe"],
+     {"subject": str(BEGUN / "bundle.zip"), "controller": str(BEGUN / "controller.npz")}),
+    ("the old model is measured on the old best's drives", GATE["old"]["probe"],
+     {"subject": FIRST_BUNDLE, "controller": FIRST_BEST, "figures": ("probe",)}),
+    ("the new model on the same", GATE["new"]["probe"], {"subject": SECOND_BUNDLE, "controller": FIRST_BEST}),
+    ("its losses too", GATE["old"]["losses"], {"controller": FIRST_BEST}),
+    ("the new one's by a moved controller", GATE["new"]["losses"],
+     {"controller": "data/rounds/02/moved.npz", "episodes": 30, "seed": 50_000}),
+    ("which is this one", requests(*GATED).refit(2, MOVED),
+     {"controller": FIRST_BEST, "to": SECOND_BUNDLE, "data": DATA, "out": MOVED}),
+    ("a subspace is of the model that counts", requests(*REFUSED).subspace(2, FEW),
+     {"bundle": FIRST_BUNDLE, "out": FEW, "views": 0}),
+    ("and perhaps of views", requests(*ROUND_2, views=8, subspace=True, go_on=True).subspace(2, FEW), {"views": 8}),
+    ("the world is of collecting and names the preset", requests(**PONG).collect(1),
+     {"preset": "pixels", "task": PONG["task"], "world":
+      {"environment": {"mode": 1}, "crop": "0:160,0:160", "skip": 4, "difference": True}}),
+    ("training too", requests(task="takecover").train(1, "mdnrnn"), {"preset": "takecover"}),
+    ("unless one is named", requests(task="takecover", preset="tiny").collect(1), {"preset": "tiny"}),
+    ("a gate of other worlds measures survival", LIVES["new"]["survival"],
+     {"subject": SECOND_BUNDLE, "controller": None, "episodes": 40, "figures": ("survival",), "seed": 50_000}),
+]  # fmt: skip
 
 
-def test_the_first_round_takes_the_presets_amounts():
-    first = requests(vae_flags="--batch 50")
-    collected, trained = first.collect(1), first.train(1, "vae")
-    assert (collected.data, collected.preset, collected.settings) == (DATA, "tiny", {"seed": 0})
-    assert (trained.data, trained.preset, trained.device) == (DATA / "rounds" / "01", "tiny", "cpu")
-    assert (trained.settings, trained.continue_from) == ({"batch": 50, "seed": 0}, None)
+@pytest.mark.parametrize(("asked", "fields"), [each[1:] for each in ASKED], ids=[each[0] for each in ASKED])
+def test_a_phase_asks_for_its_stage(asked, fields):
+    assert {name: getattr(asked, name) for name in fields} == fields
 
 
 def test_each_round_trains_and_evolves_by_chance_of_its_own_on_one_data_set():
@@ -29,112 +88,30 @@ def test_each_round_trains_and_evolves_by_chance_of_its_own_on_one_data_set():
     assert made.train(3, "vae").settings["seed"] == 7
 
 
-def test_later_rounds_add_drives_to_those_that_there_are():
-    later = requests(*ROUND_2, more_drives=580, drive_steps=300, jobs=2)
-    assert later.collect(2).settings == {"seed": 0, "episodes": 1200, "steps": 300}
-    assert later.collect(2).jobs == 2
-    drive = requests(*ROUND_2, own_drives=80, noise=0.2).drive([Path("0.npz"), Path("1.npz")])
-    assert (drive.settings, drive.controllers) == ({"seed": 0, "episodes": 700, "noise": 0.2}, ("0.npz", "1.npz"))
-    assert requests(*ROUND_2, spells=0.01).drive([Path("0.npz")]).settings["spells"] == 0.01
-    kept = later.import_kept(2)
-    assert (kept.data, kept.run, kept.runs_dir) == (DATA, "round-01", DATA / "runs")
-
-
-@pytest.mark.parametrize(("vae", "decoder_only"), [("decoder", True), ("whole", False)])
-def test_later_training_goes_on_from_the_model_that_counts(vae, decoder_only):
-    later = requests(*ROUND_2, entry(2, "bundle"), entry(2, "gate", kept=False), vae=vae)
-    trained = later.train(3, "vae")
-    assert trained.settings == {"seed": 2, "updates": 1800}
-    assert trained.continue_from == DATA / "rounds" / "01" / "vae.safetensors"
-    assert (trained.decoder_only, later.train(3, "mdnrnn").decoder_only) == (decoder_only, False)
-
-
-def test_flags_of_bundle_are_of_every_round():
-    made = requests(*ROUND_2, bundle_flags="--reward value --end 0.3")
-    for number in (1, 2):
-        found = made.bundle(number)
-        assert (found.out.name, found.reward, found.end) == (f"round-{number}.zip", "value", "0.3")
-    with pytest.raises(UsageError, match="--out"):
-        IterateConfig(bundle_flags="--out b.zip")
-
-
-def test_updates_among_the_flags_of_every_round_count_in_later_rounds_too():
-    made = requests(*ROUND_2, vae_flags="--updates 20", mdnrnn_flags="--updates 10", mdnrnn_updates=5)
-    for model, updates in (("vae", [20, 20]), ("mdnrnn", [10, 5])):
-        assert [made.train(number, model).settings["updates"] for number in (1, 2)] == updates
-
-
-def test_with_init_the_first_round_goes_on_as_later_ones_do():
-    made = requests(entry(0, "init", sha256="ab", controller="tiny"), init="tiny", vae="keep",
-                    mdnrnn_flags="--set done=true")  # fmt: skip
-    begun = DATA / "rounds" / "00"
-    train = made.train(1, "mdnrnn")
-    assert train.settings == {"seed": 0, "updates": 600, "done": True}
-    assert train.continue_from == begun / "mdnrnn.safetensors"
-    assert made.train(1, "vae").continue_from == begun / "vae.safetensors", "one that stays sees the drives too"
-    assert made.drive([Path("0.npz")]).settings["episodes"] == 80
-    refit = made.refit(1, Path("moved.npz"))
-    assert (refit.controller, refit.to) == (str(begun / "controller.npz"), "data/rounds/01/round-1.zip")
-    old = made.gate(1)["old"]["probe"]
-    assert (old.subject, old.controller) == (str(begun / "bundle.zip"), str(begun / "controller.npz"))
-    assert f"--bundle {begun / 'bundle.zip'}" in " ".join(made.run_flags(1)), "no gate has passed another"
-    run = IterateConfig(init="tiny", run_flags="--generations 3", later_run_flags="--temperature 1")
-    assert run.flags_of_run(1) == ("--generations", "3", "--temperature", "1")
-
-
-def test_both_models_are_measured_on_the_same_drives_and_tracks():
-    gate = requests(*ROUND_2, entry(2, "bundle")).gate(2)
-    old, new = (gate[side]["probe"] for side in ("old", "new"))
-    assert (old.subject, new.subject) == ("data/rounds/01/round-1.zip", "data/rounds/02/round-2.zip")
-    assert old.controller == new.controller == gate["old"]["losses"].controller == "data/runs/round-01/controller.npz"
-    assert old.figures == ("probe",)
-    losses = gate["new"]["losses"]
-    assert (losses.controller, losses.episodes, losses.seed) == ("data/rounds/02/moved.npz", 30, 50_000)
-    refit = requests(*ROUND_2, entry(2, "bundle")).refit(2, Path("moved.npz"))
-    assert (refit.controller, refit.to) == (old.controller, new.subject)
-    assert (refit.data, refit.out) == (DATA, Path("moved.npz"))
-
-
-def test_a_round_evolves_in_the_model_that_counts_with_a_seed_of_its_own():
-    made = requests(*ROUND_2, entry(2, "bundle"), entry(2, "gate", kept=False), run_flags="--generations 3")
-    few = Path("few.npz")
-    assert " ".join(made.run_flags(2, Path("start.npz"), few)) == (
-        "--generations 3 --bundle data/rounds/01/round-1.zip --seed 2 --init start.npz --subspace few.npz"
+def test_a_round_evolves_in_the_model_that_counts_with_flags_of_its_own():
+    made = requests(*REFUSED, run_flags="--generations 3")
+    assert " ".join(made.run_flags(2, Path("start.npz"), FEW)) == (
+        f"--generations 3 --bundle {FIRST_BUNDLE} --seed 2 --init start.npz --subspace few.npz"
     )
-    found = made.subspace(2, few)
-    assert (found.bundle, found.out, found.views) == ("data/rounds/01/round-1.zip", few, 0)
-    assert requests(*ROUND_2, views=8, subspace=True, go_on=True).subspace(2, few).views == 8
-
-
-def test_later_rounds_may_evolve_otherwise_than_the_first():
+    assert f"--bundle {BEGUN / 'bundle.zip'}" in " ".join(INIT.run_flags(1)), "no gate has passed another"
     made = requests(*ROUND_2, run_flags="--generations 32", later_run_flags="--generations 6 --temperature 1")
     first, later = (" ".join(made.run_flags(number)) for number in (1, 2))
     assert first.startswith("--generations 32 --bundle")
     assert later.startswith("--generations 32 --generations 6 --temperature 1 --bundle")
+    run = IterateConfig(init="tiny", run_flags="--generations 3", later_run_flags="--temperature 1")
+    assert run.flags_of_run(1) == ("--generations", "3", "--temperature", "1")
 
 
 @pytest.mark.parametrize("flags", ["--data elsewhere", "--updates 3 --seed=9", "--continue other.safetensors", "--new"])
 def test_flags_that_the_iteration_sets_itself_are_refused(flags):
     with pytest.raises(UsageError, match="--vae-flags"):
         IterateConfig(vae_flags=flags)
+    with pytest.raises(UsageError, match="--out"):
+        IterateConfig(bundle_flags="--out b.zip")
     assert IterateConfig(run_flags=flags)
 
 
-def test_the_world_of_the_data_is_of_collecting_and_names_the_preset():
-    made = requests(task="gym:ALE/Pong-v5", environment=("mode=1",), crop="0:160,0:160", skip=4, difference=True)
-    found = made.collect(1)
-    assert (found.preset, found.task) == ("pixels", "gym:ALE/Pong-v5")
-    assert found.world == {"environment": {"mode": 1}, "crop": "0:160,0:160", "skip": 4, "difference": True}
-    assert requests().collect(1).world == {}
-    assert requests(task="takecover").train(1, "mdnrnn").preset == "takecover"
-    assert requests(task="takecover", preset="tiny").collect(1).preset == "tiny"
-
-
-def test_a_gate_of_other_worlds_measures_survival_too():
-    gate = requests(*ROUND_2, entry(2, "bundle"), task="takecover", gate_drives=0, gate_losses=0).gate(2)
-    found = gate["new"]["survival"]
-    assert (found.subject, found.controller, found.episodes) == ("data/rounds/02/round-2.zip", None, 40)
-    assert (found.figures, found.seed) == (("survival",), 50_000)
-    assert gate["old"].keys() == {"survival"}
-    assert "survival" not in requests(*ROUND_2, entry(2, "bundle")).gate(2)["old"]
-    assert requests(*ROUND_2, entry(2, "bundle"), gate_lives=9).config.survival_episodes == 9
+def test_survival_is_measured_alone_and_not_of_the_first_world():
+    assert LIVES["old"].keys() == {"survival"}
+    assert "survival" not in GATE["old"]
+    assert requests(*GATED, gate_lives=9).config.survival_episodes == 9

@@ -87,10 +87,9 @@ def test_a_live_runs_archive_is_drawn_from_its_journal_and_goes_on_after_a_resta
 
     def score(generations):
         while len(bench.run.history) < generations:
-            for send in bench.run.fleet.dispatch(bench.now):
-                for work in send.work:
-                    place = work.job.candidate + work.job.generation
-                    bench.answer(Result(work.job.digest, float(place), 10, 0.1, None, None, measures=(place, 0.7)))
+            for _, job in bench.fetch():
+                place = job.candidate + job.generation
+                bench.answer(Result(job.digest, float(place), 10, 0.1, None, None, measures=(place, 0.7)))
 
     score(1)
     bench.restart()  # what was found before is read from the journal

@@ -8,25 +8,23 @@ from contextlib import closing
 
 from dreamfleet.common.addons.analysis.comparison import ComparedRun, at_equal_budget, differing_settings
 from dreamfleet.common.runs.effort import START_EFFORT
-from dreamfleet.common.runs.records import StoredConfirmation
-from dreamfleet.common.runs.run_folder import CONFIRMED, RunFolder
+from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, VALIDATION
-from tests.support.journals import change_journal
+from tests.support.journals import change_journal, confirm
 from tests.support.processes import call_here, printed
 from tests.support.tables import cells
 
 RESULT = "INSERT INTO result VALUES (?, 'evaluate', ?, 0, ?, ?, ?, 10, 0.1, 'w', 'f', 1, 'c', NULL)"
 
 
-def confirm(path, scores):
+def confirm_by(path, scores):
     """As a run ends: its last evaluated mean on fresh tracks."""
     with RunFolder(path) as run:
         last, closed = run.evaluations()[-1].generation, len(run.history())
     for episode, score in enumerate(scores, CONFIRMING_OFFSET):
         digest = f"{path.name}{episode}".encode()
         change_journal(path, RESULT, digest, last, episode, VALIDATION.start + episode, score)
-    found = StoredConfirmation(last, len(scores), sum(scores) / len(scores), 1.0, closed)
-    change_journal(path, "INSERT INTO run VALUES (?, ?)", CONFIRMED, found.to_json())
+    confirm(path, last, len(scores), sum(scores) / len(scores), 1.0, closed)
 
 
 def side(path):
@@ -56,8 +54,8 @@ def test_at_an_equal_budget_no_evaluated_mean_exceeds_it(runs):
 
 
 def test_the_verb_prints_differences_of_scores_on_common_tracks(runs):
-    confirm(runs / "dream", [1.0, 2.0, 3.0, 4.0])
-    confirm(runs / "reality", [2.0, 3.5, 3.5, 5.5, 99.0])
+    confirm_by(runs / "dream", [1.0, 2.0, 3.0, 4.0])
+    confirm_by(runs / "reality", [2.0, 3.5, 3.5, 5.5, 99.0])
     assert "+1.1 ± 0.2" in printed("compare", "dream", "reality")
     found = json.loads(printed("compare", "dream", "reality", "--json"))["differences"]
     assert [each["of"] for each in found] == ["at equal steps in reality", "at equal core-hours", "confirmed"]

@@ -13,13 +13,12 @@ from pyarrow import parquet
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.processes import command
-from dreamfleet.common.runs.records import StoredConfirmation
 from dreamfleet.common.runs.run_folder import CONFIRMED, RunFolder
 from dreamfleet.coordinator.addons.runs.export import export_csv, export_parquet, export_tensorboard
 from dreamfleet.experiments.verbs.compare import SAME_SEEDS
 from tests.support.disks import small_disk
 from tests.support.events import scalars
-from tests.support.journals import change_journal
+from tests.support.journals import change_journal, confirm
 from tests.support.processes import DEADLINE, call_here, printed
 from tests.support.tables import cells
 
@@ -135,8 +134,7 @@ def test_an_evaluation_of_one_episode_has_no_error_in_any_export_or_view(runs, e
 @pytest.mark.parametrize("write", [export_csv, export_parquet])
 def test_no_table_of_an_earlier_export_stands_among_those_of_a_later_one(runs, tmp_path, write):
     """A recall can take a run's confirmation."""
-    confirmed = StoredConfirmation(1, 4, 1.0, 1.0, 999)
-    change_journal(runs / "reality", "INSERT INTO run VALUES (?, ?)", CONFIRMED, confirmed.to_json())
+    confirm(runs / "reality", 1, 4, 1.0, 1.0, 999)
     with RunFolder(runs / "reality") as run:
         write(run, tmp_path)
     change_journal(runs / "reality", "DELETE FROM run WHERE key = ?", CONFIRMED)

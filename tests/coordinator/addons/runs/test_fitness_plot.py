@@ -8,15 +8,10 @@ import pytest
 
 from dreamfleet.common.addons.analysis.fitness_chart import WINDOW, running_median
 from dreamfleet.common.addons.analysis.learning import LearningCurve
-from dreamfleet.common.runs.records import StageSettings, StoredConfirmation
-from dreamfleet.common.runs.run_folder import CONFIRMED, RunFolder
+from dreamfleet.common.runs.records import StageSettings
+from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.addons.runs.plot import fitness_figure, learning_figure
-from tests.support.journals import change_journal, change_settings
-
-
-def confirm(run, generation):
-    text = StoredConfirmation(generation, 4, -30.0, 9.0, 99).to_json()
-    change_journal(run, "INSERT INTO run VALUES (?, ?)", CONFIRMED, text)
+from tests.support.journals import change_settings, confirm
 
 
 def draw(path):
@@ -34,7 +29,7 @@ def star_of(axes):
 @pytest.mark.parametrize(("name", "last"), [("dream", 11), ("reality", 2), ("hidden", None)])
 def test_nothing_is_cut_and_ticks_are_generations(runs, name, last):
     if last is not None:
-        confirm(runs / name, last)
+        confirm(runs / name, last, 4, -30.0, 9.0, 99)
     figure = draw(runs / name)
     drawn = [*figure.legends, *(each for axes in figure.axes for each in (axes.title, axes.yaxis.label))]
     for each in drawn:
@@ -75,7 +70,7 @@ def test_a_running_median_is_no_lucky_generations_and_crosses_no_stage():
 
 
 def test_a_confirmed_score_at_the_end_of_a_learning_curve_is_within_the_panel(runs):
-    confirm(runs / "reality", 2)
+    confirm(runs / "reality", 2, 4, -30.0, 9.0, 99)
     with RunFolder(runs / "reality") as run:
         figure = learning_figure([LearningCurve.of(run)], None)
     figure.draw_without_rendering()

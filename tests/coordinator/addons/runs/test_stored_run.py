@@ -6,7 +6,7 @@ from typing import get_args
 
 import pytest
 
-from dreamfleet.common.errors import BundleError, ControllerError, JournalError, MissingExtraError, UsageError
+from dreamfleet.common.errors import BundleError, ControllerError, MissingExtraError, UsageError
 from dreamfleet.coordinator.addons.runs.export import ELITES, TABLES
 from dreamfleet.coordinator.addons.runs.plot import KINDS, fitness_figure, save_figure
 from dreamfleet.coordinator.addons.runs.stored_run import TableName, open_run
@@ -95,8 +95,3 @@ def test_its_controller_and_world_model_are_those_of_its_folder(reality):
     reality.controller_path.unlink()
     with pytest.raises(ControllerError, match=r"reality\b.*controller\.npz"):
         reality.controller()
-
-
-def test_an_unknown_run_names_those_that_there_are(runs):
-    with pytest.raises(JournalError, match="reality"):
-        open_run("realty")

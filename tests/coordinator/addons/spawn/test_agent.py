@@ -33,8 +33,9 @@ def test_a_missing_file_is_reported_and_the_lock_released(tmp_path, capsys):
         assert "No such file" in answer(asked, capsys)["failed"]
 
 
-def test_a_folder_removed_while_waiting_for_its_lock_is_created_again(tmp_path, monkeypatch):
-    host_folder, take = HostFolder(str(tmp_path / "place"), Channel()), HostFolder._acquire
+def remove_meanwhile(monkeypatch):
+    """Somebody removes the folder while the next who locks it waits."""
+    take = HostFolder._acquire
 
     def removed(self, lock):
         monkeypatch.setattr(HostFolder, "_acquire", take)
@@ -42,6 +43,11 @@ def test_a_folder_removed_while_waiting_for_its_lock_is_created_again(tmp_path, 
         take(self, lock)
 
     monkeypatch.setattr(HostFolder, "_acquire", removed)
+
+
+def test_a_folder_removed_while_waiting_for_its_lock_is_created_again(tmp_path, monkeypatch):
+    host_folder = HostFolder(str(tmp_path / "place"), Channel())
+    remove_meanwhile(monkeypatch)
     with host_folder.locked():
         assert (host_folder.root / "lock").exists()
 
@@ -82,16 +88,10 @@ def test_a_removal_that_was_interrupted_at_its_last_step_is_finished(tmp_path, c
 
 
 def test_an_end_that_waited_for_a_removal_leaves_nothing(tmp_path, monkeypatch, capsys):
-    host_folder, take = HostFolder(str(tmp_path / "place"), Channel()), HostFolder._acquire
+    host_folder = HostFolder(str(tmp_path / "place"), Channel())
     with host_folder.locked():
         pass
-
-    def removed(self, lock):
-        monkeypatch.setattr(HostFolder, "_acquire", take)
-        self.remove()
-        take(self, lock)
-
-    monkeypatch.setattr(HostFolder, "_acquire", removed)
+    remove_meanwhile(monkeypatch)
     assert answer({**ending({"root": host_folder.root}), "keep": True}, capsys)["ok"] == {"ended": []}
     assert not host_folder.root.exists()
 
