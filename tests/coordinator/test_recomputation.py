@@ -14,19 +14,19 @@ import pytest
 
 from tests.support.processes import printed
 
-TASK, BRITTLE = "tests.support.tasks:Toy", "tests.support.tasks:Brittle"
+TASK, NAME = "tests.support.tasks:Toy", "plain"
 CHOOSING, CONFIRMING, FIRST_VALIDATION = 10_000, 20_000, 20_000  # episodes that choose, that confirm; the first seed
 CONFIRM_EPISODES, FINALISTS = 12, 4
 
 
-def started(processes, name, bundle, *flags, task=TASK):
+def started(processes, bundle):
     """A run to its end; what the coordinator answered."""
     coordinator = processes.coordinator(
-        "--bundle", bundle.path, "--task", task, "--population", 6, "--episodes", 4, "--sigma0", 0.3, "--seed", 7,
+        "--bundle", bundle.path, "--task", TASK, "--population", 6, "--episodes", 4, "--sigma0", 0.3, "--seed", 7,
         "--evaluate-every", 1, "--evaluation-episodes", 5, "--confirm-episodes", CONFIRM_EPISODES, "--generations", 6,
-        "--json", *flags, name=name,
+        "--json", name=NAME,
     )  # fmt: skip
-    worker = processes.worker("--task", task, "--run", name)
+    worker = processes.worker("--task", TASK, "--run", NAME)
     code, out = coordinator.finish()
     worker.end()
     assert code == 0
@@ -44,31 +44,19 @@ class Recomputed:
             ).fetchall()
             candidates = journal.execute("SELECT generation, number, vector, fitness FROM candidate").fetchall()
             evaluated = journal.execute("SELECT generation, vector, mean, std FROM evaluation ORDER BY 1").fetchall()
-            self.events = [text for (text,) in journal.execute("SELECT text FROM event")]
-            drawn = {number: set(json.loads(seeds)) for number, seeds, *_ in self.generations}  # the last ones
-            place = "kind, generation, candidate, episode, seed"
-            self.results, self.failed = {}, {}
-            for *key, episode, seed, fitness, steps in journal.execute(f"SELECT {place}, fitness, steps FROM result"):
-                if key[0] != "score" or seed in drawn[key[1]]:
-                    self.results.setdefault(tuple(key), {})[episode] = seed, fitness, steps
-            for *key, episode, seed in journal.execute(f"SELECT {place} FROM failure"):
-                if key[0] != "score" or seed in drawn[key[1]]:
-                    self.failed.setdefault(tuple(key), set()).add(episode)
+            self.results = {}
+            query = "SELECT kind, generation, candidate, episode, seed, fitness, steps FROM result"
+            for *key, episode, seed, fitness, steps in journal.execute(query):
+                self.results.setdefault(tuple(key), {})[episode] = seed, fitness, steps
         self.candidates = {tuple(place): (np.frombuffer(each, "<f4"), score) for *place, each, score in candidates}
         self.evaluated = {number: (np.frombuffer(each, "<f4"), *score) for number, each, *score in evaluated}
         self.settings = json.loads(self.facts["settings"])
 
     def fitness(self, generation):
-        """Each candidate's mean over its episodes; NaN for one that failed."""
-        found = []
-        for number in range(self.settings["population"]):
-            place = ("score", generation, number)
-            if place in self.failed:
-                found.append(np.nan)
-                continue
-            assert self.results[place].keys() == set(range(self.settings["episodes"]))
-            found.append(np.mean([fitness for _, (_, fitness, _) in sorted(self.results[place].items())]))
-        return np.array(found)
+        """Each candidate's mean over its episodes."""
+        rows = [self.results["score", generation, number] for number in range(self.settings["population"])]
+        assert all(row.keys() == set(range(self.settings["episodes"])) for row in rows)
+        return np.array([np.mean([fitness for _, (_, fitness, _) in sorted(row.items())]) for row in rows])
 
     def look(self, generation):
         """Mean, standard error and population deviation of one evaluation."""
@@ -78,25 +66,18 @@ class Recomputed:
 
     def drive(self, generation, first, count):
         """The scores of one mean in a round of the confirmation, on seeds that follow from the episode's number."""
-        rows, failed = self.results["evaluate", generation, 0], self.failures(generation)
-        scored = [episode for episode in range(first, first + count) if episode not in failed]
-        assert [rows[episode][0] for episode in scored] == [FIRST_VALIDATION + episode for episode in scored]
-        return np.array([rows[episode][1] for episode in scored])
-
-    def failures(self, generation):
-        """The episodes of a mean's evaluation and confirmation that failed."""
-        return self.failed.get(("evaluate", generation, 0), set())
+        rows = [self.results["evaluate", generation, 0][episode] for episode in range(first, first + count)]
+        assert [seed for seed, *_ in rows] == [FIRST_VALIDATION + first + each for each in range(count)]
+        return np.array([fitness for _, fitness, _ in rows])
 
     def rank(self, generation):
-        """Evaluated means are ordered by failed episodes, then by their score; of equals the earliest is better."""
-        failed = sum(episode < CHOOSING for episode in self.failures(generation))
-        return failed, -self.look(generation)[0], generation
+        """Evaluated means are ordered by their score; of equals the earliest is better."""
+        return -self.look(generation)[0], generation
 
     def confirmed(self):
         """The generation that successive halving leaves, with its mean and standard error on fresh seeds."""
         looks = {generation: self.look(generation) for generation in self.evaluated}
         left = sorted(looks, key=self.rank)[:FINALISTS]
-        failed = {each: self.rank(each)[0] for each in left}
         totals = {each: (looks[each][0] * looks[each][3], looks[each][3]) for each in left}
         first = CHOOSING
         while len(left) > 1:
@@ -105,8 +86,7 @@ class Recomputed:
                 total, seen = totals[each]
                 scores = self.drive(each, first, count)
                 totals[each] = total + scores.sum(), seen + len(scores)
-                failed[each] += count - len(scores)
-            left.sort(key=lambda each: (failed[each], -totals[each][0] / totals[each][1], each))
+            left.sort(key=lambda each: (-totals[each][0] / totals[each][1], each))
             first, left = first + count, left[: -(-len(left) // 2)]
         scores = self.drive(left[0], CONFIRMING, CONFIRM_EPISODES)
         return left[0], scores.mean(), scores.std(ddof=1) / np.sqrt(len(scores))
@@ -138,24 +118,22 @@ def check_search(found):
         stored = np.array([found.candidates[number, index][1] for index in range(len(asked))], dtype=np.float64)
         np.testing.assert_allclose(stored, fitness, rtol=1e-14)
         np.testing.assert_array_equal(np.argsort(-stored, kind="stable"), np.argsort(-fitness, kind="stable"))
-        scored = fitness[np.isfinite(fitness)]
-        expected = scored.mean(), scored.std(), scored.max(), scored.min()
+        expected = fitness.mean(), fitness.std(), fitness.max(), fitness.min()
         assert (mean, std, best, worst) == pytest.approx(expected, rel=1e-12)
-        rows = [found.results["score", number, index] for index in np.flatnonzero(np.isfinite(fitness)).tolist()]
+        rows = [found.results["score", number, index] for index in range(len(asked))]
         assert steps == sum(each[2] for row in rows for each in row.values())
         assert {row[0][0] for row in rows} == {json.loads(seeds)[0]}, "all candidates drive the same seeds"
-        last = np.nextafter(stored[np.isfinite(stored)].min(), -np.inf)  # for those that failed
-        strategy.tell(asked, (-np.where(np.isfinite(stored), stored, last)).tolist())
+        strategy.tell(asked, (-stored).tolist())
         np.testing.assert_array_equal(found.evaluated[number][0], strategy.mean.astype("<f4"))
 
 
-def check_scores(processes, name, found, answer):
+def check_scores(processes, found, answer):
     """Each place that shows an evaluation or the confirmed score has the same mean and error."""
     looks = {generation: found.look(generation) for generation in found.evaluated}
     for generation, (mean, _, deviation, _) in looks.items():
         assert found.evaluated[generation][1:] == pytest.approx((mean, deviation))
-    shown, folder = json.loads(printed("runs", "show", name, "--json")), processes.folder / name
-    printed("runs", "export", name, "--csv", "--out", folder)
+    shown, folder = json.loads(printed("runs", "show", NAME, "--json")), processes.folder / NAME
+    printed("runs", "export", NAME, "--csv", "--out", folder)
     exported = {path.stem: list(csv.DictReader(path.read_text().splitlines())) for path in folder.glob("*.csv")}
     for rows in (shown["evaluations"], exported["evaluations"]):
         assert [int(each["generation"]) for each in rows] == list(looks)
@@ -165,7 +143,7 @@ def check_scores(processes, name, found, answer):
     assert answer["best"]["generation"] == best
     assert [answer["best"]["mean"], answer["best"]["error"]] == pytest.approx(looks[best][:2])
     generation, mean, error = found.confirmed()
-    with np.load(processes.runs / name / "controller.npz") as file:
+    with np.load(processes.runs / NAME / "controller.npz") as file:
         report = json.loads(str(file["about"]))["provenance"]
         np.testing.assert_array_equal(file["parameters"], found.evaluated[generation][0])
     assert (report["generation"], report["confirmed"]) == (generation, True)
@@ -173,12 +151,12 @@ def check_scores(processes, name, found, answer):
     for each in (answer["confirmed"], shown["confirmed"], *exported["confirmation"]):
         assert int(each["generation"]) == generation
         assert [float(each["mean"]), float(each["error"])] == pytest.approx([mean, error])
-    assert f"{mean:.1f} ± {error:.1f}" in printed("runs", "show", name)
+    assert f"{mean:.1f} ± {error:.1f}" in printed("runs", "show", NAME)
 
 
-def check_status(processes, name, found):
+def check_status(processes, found):
     """A coordinator that goes on and waits for workers tells the same of what was."""
-    coordinator = processes.resume(name, "--generations", 99)
+    coordinator = processes.resume(NAME, "--generations", 99)
     coordinator.wait_until_serving()
     code, out, err = processes.call("status", "--connect", processes.endpoint, "--json")
     coordinator.end()
@@ -194,32 +172,15 @@ def check_status(processes, name, found):
     confirmed = status["confirmed"]
     assert (confirmed["generation"], confirmed["mean"], confirmed["error"]) == pytest.approx(found.confirmed())
     fitness = found.fitness(last)
-    assert status["last"].get("failed", 0) == np.isnan(fitness).sum()
-    fitness = fitness[np.isfinite(fitness)]
     shown = [status["last"][each] for each in ("mean", "std", "best", "worst")]
     assert shown == pytest.approx([fitness.mean(), fitness.std(), fitness.max(), fitness.min()])
 
 
 @pytest.mark.slow
 def test_a_run_is_what_its_journal_comes_to(processes, random_bundle):
-    answer = started(processes, "plain", random_bundle)
-    found = Recomputed(processes.runs / "plain" / "journal.sqlite")
+    answer = started(processes, random_bundle)
+    found = Recomputed(processes.runs / NAME / "journal.sqlite")
     assert len(found.generations) == 7
     check_search(found)
-    check_scores(processes, "plain", found, answer)
-    check_status(processes, "plain", found)
-
-
-@pytest.mark.slow
-def test_a_run_with_failures_is_what_its_journal_comes_to(processes, random_bundle):
-    answer = started(
-        processes, "brittle", random_bundle, "--evaluation-episodes", 9, "--failure-limit", 1, "--generations", 4,
-        task=BRITTLE,
-    )  # fmt: skip
-    found = Recomputed(processes.runs / "brittle" / "journal.sqlite")
-    kinds = {kind for kind, _, _ in found.failed}
-    assert kinds == {"score", "evaluate"}, "choose another seed"
-    assert any("it gets other seeds" in each for each in found.events), "choose another seed"
-    check_search(found)
-    check_scores(processes, "brittle", found, answer)
-    check_status(processes, "brittle", found)
+    check_scores(processes, found, answer)
+    check_status(processes, found)

@@ -71,6 +71,7 @@ def test_evaluations_of_one_mean_share_their_scores_whichever_is_asked_first():
         assert evaluations.record(work.job.digest, float(number)) == [2, 5]
     finished = [evaluations.finish(generation).found for generation in (2, 5)]
     assert [each.mean for each in finished] == [1.0, 1.0]
+    assert Evaluations([*evaluations.rows, StoredEvaluation(6, 2, 9.0, 0.0, failed=1)]).best.generation == 2
     known = {work.job.digest: 4.0 for work in first}
     assert evaluations.open(Evaluation(8, vector, 3), SPEC, known) == []
     assert evaluations.finish(8).found.mean == 4.0

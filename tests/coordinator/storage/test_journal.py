@@ -114,12 +114,13 @@ def test_only_the_last_two_states_stay(journal):
     assert count == 2
 
 
-def test_finalists_are_the_best_means_each_once(journal):
-    vectors = [bytes([each]) * 8 for each in range(4)]
-    for generation, vector, mean in ((1, 0, 5.0), (2, 1, 7.0), (3, 1, 7.0), (4, 2, 7.0), (5, 3, 6.0)):
+def test_finalists_are_the_best_means_each_once_those_with_failed_episodes_last(journal):
+    vectors = [bytes([each]) * 8 for each in range(5)]
+    rows = ((1, 0, 5.0, 0), (2, 1, 7.0, 0), (3, 1, 7.0, 0), (4, 2, 7.0, 0), (5, 3, 6.0, 0), (6, 4, 9.0, 1))
+    for generation, vector, mean, failed in rows:
         journal.schedule_evaluation(Evaluation(generation, vectors[vector], 2))
-        journal.finish_evaluation(generation, StoredEvaluation(generation, 2, mean, 1.0), 0)
-    assert [each.generation for each in journal.finalists(3)] == [2, 4, 5]
+        journal.finish_evaluation(generation, StoredEvaluation(generation, 2 - failed, mean, 1.0, failed), failed)
+    assert [each.generation for each in journal.finalists(5)] == [2, 4, 5, 1, 6]
     assert journal.finalists(1) == [Finalist(2, vectors[1], 2, 7.0)]
 
 
