@@ -9,9 +9,11 @@ import hashlib
 import json
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
+from dreamfleet.common.errors import NotWritableNowError
 from dreamfleet.common.printable import plural, truncate
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.batches import (
@@ -31,6 +33,7 @@ from dreamfleet.common.protocol.batches import (
 )
 from dreamfleet.common.protocol.messages import MAX_PART, UploadPart
 from dreamfleet.common.runs.seeds import remark_on_seeds, training_seed
+from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.upload_assembler import TOO_MANY, UploadAssembler
 from dreamfleet.coordinator.run.external_generations import CANCELLED, ExternalGenerations
 from dreamfleet.coordinator.run.run import Run
@@ -55,9 +58,14 @@ class Batches:
         self._uploads = UploadAssembler()
         self._remarked = False  # on test seeds: once in a coordinator's life
         self._announced: tuple[str, int] | None = None  # the open batch's id and its candidates that were done
+        self._durable: Generation | None = None  # the open generation as the journal has it
 
     def answer(self, verb: str, get: Parameters, payload: bytes, now: float) -> BatchReply:
-        """The reply to a query `submit`, `read`, `cancel` or `list`, whose parameters `get` returns."""
+        """The reply to a query `submit`, `read`, `cancel` or `list`, whose parameters `get` returns.
+
+        R29: while the journal cannot be written, nothing is taken, and the reply says what is durable.
+        """
+        stalled = self._run.state.stalled
         verbs: dict[str, Callable[[], BatchReply]] = {
             "submit": lambda: self._submit(BatchHeader.from_parameters(get), read_count(get, "offset"), payload, now),
             "read": lambda: self._describe(self._find(get), read_count(get, "offset")),
@@ -73,9 +81,22 @@ class Batches:
                 )
             if verb not in verbs:
                 raise BatchError("malformed", f"{truncate(verb, 60)!r} is no verb of batches: {', '.join(verbs)}")
-            return verbs[verb]()
+            if stalled is not None and verb in ("submit", "cancel"):
+                raise BatchError("busy", f"run {self._name} is paused: {stalled.why}. Then send the same again")
+            with nullcontext() if stalled is None else self._journal.as_committed():
+                return verbs[verb]()
         except BatchError as error:
             return replace(self._head(), refused=error.refusal, why=truncate(str(error), 1000))
+        except NotWritableNowError as error:
+            if stalled is not None:
+                raise
+            self._run.wait_until_writable(error)
+            return self.answer(verb, get, payload, now)
+
+    @property
+    def is_durable(self) -> bool:
+        """Whether an answer waits for no commit."""
+        return self._run.state.stalled is not None
 
     def tick(self, now: float) -> None:
         """Forget uploads without progress: their senders begin again."""
@@ -85,6 +106,7 @@ class Batches:
         """An event for each closed generation, and with `progress` one for the open batch if it has new scores."""
         if not self._run.settings.is_external:
             return []
+        self._durable = None
         found = [batch for number in closed if (batch := self._journal.batches.of(number)) is not None]
         events = [self._event(batch, batch.population) for batch in found]
         generation = self._run.generation
@@ -197,13 +219,13 @@ class Batches:
 
     def _page(self, batch: StoredBatch, offset: int) -> tuple[list[float | None], dict[int, str], int]:
         """Fitness from `offset` on, why some candidates have none, and how many candidates are done."""
-        generations, generation = self._run.generations, self._run.generation
+        generations, generation = self._run.generations, self._open_generation
         limit = min(PAGE_CANDIDATES, max(batch.population - offset, 0))
         if batch.generation is None:
             if batch.state != "cancelled":
                 return [None] * limit, {}, 0
             return [None] * limit, dict.fromkeys(range(offset, offset + limit), CANCELLED), batch.population
-        if batch.generation != generation.number:
+        if generation is None or batch.generation != generation.number:
             fitness = self._journal.batches.fitness_page(batch.generation, offset, limit)
             return fitness, dict(batch.errors), batch.population
         assert isinstance(generations, ExternalGenerations)
@@ -216,6 +238,16 @@ class Batches:
         for each in failed:
             fitness[each - offset] = None
         return fitness, generations.find_errors(generation, failed) if failed else {}, sum(is_done)
+
+    @property
+    def _open_generation(self) -> Generation | None:
+        """The open generation: while the journal cannot be written, as it is there, where there may be none."""
+        if self._run.state.stalled is None:
+            return self._run.generation
+        stored = None if self._durable else self._journal.last_generation()
+        if stored is not None and not self._journal.is_closed(stored.number):
+            self._durable = self._run.generations.reload(stored.number)
+        return self._durable
 
     def _head(self) -> BatchReply:
         run = self._run

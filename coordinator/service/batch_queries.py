@@ -29,27 +29,36 @@ class BatchQueries:
         return bool(self._replies)
 
     def handle(self, query: zenoh.Query, now: float) -> None:
-        """Do what a query says; its reply waits."""
+        """Do what a query says; its reply waits, unless it says only what is durable."""
         key = str(query.key_expr)
         verb = key.rsplit("/", 1)[-1]
         payload = query.payload.to_bytes() if query.payload is not None else b""
         reply = self._batches.answer(verb if key == keys.batch(self._name, verb) else key, query.parameters.get,
                                      payload, now)  # fmt: skip
-        self._replies.append((query, reply))
+        if self._batches.is_durable:
+            _reply(query, reply)
+        else:
+            self._replies.append((query, reply))
 
     def send(self, session: zenoh.Session, closed: Iterable[int], now: float, *, durable: bool) -> None:
-        """Reply, and publish what changed, if the journal is `durable`; else drop the queries, which are repeated.
+        """Reply, and publish what changed, if the journal is `durable`; else reply what the journal has.
 
         R29: nobody hears of a batch or a score that is not on disk, so no crash takes back what an answer said.
         """
         self._batches.tick(now)
         replies, self._replies = self._replies, []
         for query, reply in replies:
-            with query:
-                if durable:
-                    query.reply(query.key_expr, encode_json(reply), encoding="application/json")
+            if durable:
+                _reply(query, reply)
+            else:
+                self.handle(query, now)
         if durable:
             progress = now - self._progress_at >= PROGRESS_INTERVAL
             self._progress_at = now if progress else self._progress_at
             for event in self._batches.take_events(closed, progress=progress):
                 session.put(keys.event_batch(self._name), encode_json(event), encoding="application/json")
+
+
+def _reply(query: zenoh.Query, reply: BatchReply) -> None:
+    with query:
+        query.reply(query.key_expr, encode_json(reply), encoding="application/json")

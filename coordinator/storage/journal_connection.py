@@ -146,9 +146,24 @@ class JournalConnection:
 
     def forget_writes(self) -> None:
         """Drop everything written since the last commit."""
+        self._drop_writes()
+        self.opened = self._committed
+
+    @contextmanager
+    def as_committed(self) -> Iterator[None]:
+        """Read what is durable, without what waits to be written. A locked journal does not hold it up."""
+        waiting = [*self._uncommitted, *self._writes]
+        try:
+            self._drop_writes()
+            yield
+        finally:
+            self._drop_writes()
+            self._writes = waiting
+
+    def _drop_writes(self) -> None:
         with suppress(sqlite3.Error):
             self._connection.rollback()
-        self._writes, self._uncommitted, self.opened = [], [], self._committed
+        self._writes, self._uncommitted = [], []
 
     def take_lock(self) -> None:
         """Flush in a transaction: until its commit no other program can lock the journal. Errors as of `flush`."""

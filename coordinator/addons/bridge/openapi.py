@@ -31,7 +31,7 @@ _ERRORS = {
     "404": "unknown: no such batch, or no live run of this name",
     "409": "conflict: the id belongs to another content. Or not external: the run has a search of its own",
     "502": "failed: the coordinator has another version, or this host cannot ask it",
-    "503": "busy: the coordinator does not answer now, or too much waits. Send the same again after Retry-After",
+    "503": "busy: the coordinator does not answer or cannot write now, or too much waits. Repeat after Retry-After",
 }
 _SUBMISSION_ERRORS = {
     "408": "malformed: no further byte of the body came in time",

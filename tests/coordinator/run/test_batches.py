@@ -128,6 +128,38 @@ def test_a_restart_anywhere_loses_no_batch_and_no_score(door, done):
     assert door.run.background_jobs.report.current is None
 
 
+@pytest.mark.parametrize("is_closed", [False, True])
+def test_while_the_disk_is_full_reads_say_what_is_durable_and_nothing_is_taken(door, is_closed):
+    door.submit("a")
+    door.submit("b", first=9.0)
+    door.go_on()
+    door.work(2)
+    before, listed = door.query("read", id="a"), door.query("list").batches
+    assert (before.state, before.done) == ("running", 1)
+    door.score()
+    if is_closed:
+        door.run.advance(door.now)
+    pages = door.journal.read_row("PRAGMA page_count")[0]
+    door.journal._connection.execute(f"PRAGMA max_page_count = {pages + 10}")
+    refused = door.submit("large", count=9000)
+    stalled = door.run.state.stalled
+    assert (refused.refused, refused.run_state) == ("busy", "paused")
+    assert stalled.why in refused.why
+    for _ in range(2):
+        read = door.query("read", id="a")
+        assert read == replace(before, run_state="paused", run_why=stalled.why)
+        assert door.query("list").batches == listed
+        assert [door.query("cancel", id="b").refused, door.submit("small").refused] == ["busy", "busy"]
+    door.journal._connection.execute("PRAGMA max_page_count = 1000000")
+    door.run.tick(stalled.retry_at)
+    door.go_on()
+    door.go_on()
+    assert door.query("read", id="a").done == 2
+    assert door.query("read", id="a").state == "complete"
+    assert door.submit("large", count=9000).state == "waiting"
+    assert door.submit("small").is_new
+
+
 @pytest.mark.parametrize("is_killed", [False, True])
 def test_a_cancelled_batch_keeps_its_scores(door, is_killed):
     door.submit("a", count=3)
