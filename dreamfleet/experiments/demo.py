@@ -35,6 +35,7 @@ from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.keys import check_run_name
+from dreamfleet.common.runs.lookup import shipped_subspace_name
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL, resume_command
 from dreamfleet.common.runs.seeds import TEST
@@ -298,8 +299,6 @@ def _evaluation_flags(every: int, tracks: int, confirming: int) -> dict[str, obj
 
 def plan_runs(config: DemoConfig, name: str, runs_dir: Path) -> tuple[DemoRun, ...]:
     """The demonstration's runs, in order."""
-    from dreamfleet.common.runs.lookup import shipped_subspace_name
-
     found, plan = [], config.plan
     subspace = (shipped_subspace_name(plan.bundle) or NO_SUBSPACE) if config.subspace is None else config.subspace
     few = subspace != NO_SUBSPACE

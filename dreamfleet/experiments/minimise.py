@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -147,8 +148,6 @@ def maximise(
 def _is_noisy(function: Callable[..., Any] | str) -> bool:
     if not isinstance(function, str):
         return takes_seed(function)
-    from importlib import import_module
-
     module, _, name = function.rpartition("function:")[2].partition(":")
     try:
         return takes_seed(attrgetter(name)(import_module(module)))

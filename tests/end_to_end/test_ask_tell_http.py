@@ -2,7 +2,7 @@
 
 Tests coordinator/addons/bridge/app.py, coordinator/addons/bridge/changes.py,
 coordinator/addons/bridge/config.py, coordinator/addons/bridge/openapi.py,
-coordinator/addons/bridge/server.py and coordinator/addons/bridge/verb.py.
+and coordinator/addons/bridge/verb.py.
 """
 
 import base64
@@ -160,10 +160,10 @@ def test_bad_requests_are_refused_and_lose_nothing(bridge):
 
 
 IMPATIENT = """
-from dreamfleet.coordinator.addons.bridge import app, server
+from dreamfleet.coordinator.addons.bridge import app, verb
 from dreamfleet.coordinator.addons.web import server as web
 
-app.BODY_TIMEOUT, web.IDLE_TIMEOUT, server.KEEP_ALIVE = 3.0, 1.0, 4
+app.BODY_TIMEOUT, web.IDLE_TIMEOUT, verb.KEEP_ALIVE = 3.0, 1.0, 4
 """  # Python imports it as `sitecustomize` before the verb begins
 
 

@@ -1,5 +1,5 @@
 """Routers of their own: coordinator and workers only connect out, and meet there.
-Tests common/addons/router/router.py and common/addons/router/verb.py."""
+Tests common/addons/router/verb.py."""
 
 import json
 import os

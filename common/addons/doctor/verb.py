@@ -6,15 +6,13 @@ import argparse
 import json
 import platform
 import sys
-from typing import TYPE_CHECKING
 
+from dreamfleet.common.addons.doctor.health import ABSENT, Finding, missing_for_role, run_checks
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_rows
+from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.printable import plural
-
-if TYPE_CHECKING:
-    from dreamfleet.common.addons.doctor.health import Finding
 
 SUMMARY = "check this installation: versions, fingerprint, what each role lacks and the remedy"
 EXTRAS = ()
@@ -34,9 +32,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the report; exit 1 if `--role` cannot be played."""
-    from dreamfleet.common.addons.doctor.health import missing_for_role, run_checks
-    from dreamfleet.common.host.fingerprint import fingerprint
-
     findings = run_checks(args.runs_dir, args.global_config.join, args.task)
     roles = {role: missing_for_role(role, findings) for role in ALL_ROLES}
     host = {"python": platform.python_version(), "platform": platform.platform(), "cores": usable_cores(),
@@ -55,8 +50,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _row(each: Finding) -> dict[str, object]:
-    from dreamfleet.common.addons.doctor.health import ABSENT
-
     state = "ok" if each.ok else "missing" if each.found == ABSENT else "failed" if each.needed else "warning"
     return {"state": state, "check": each.name, "found": each.found, "for": each.role,
             "remedy": "" if each.ok else each.remedy}  # fmt: skip

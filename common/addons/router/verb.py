@@ -1,13 +1,19 @@
-"""`dreamfleet router`: a meeting point for coordinators and workers that cannot reach each other."""
+"""`dreamfleet router`: a meeting point, without state, for coordinators and workers that cannot reach each other."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import logging
 import signal
+from collections import Counter
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
+from time import monotonic
+
+import zenoh
 
 from dreamfleet.common.cli.config import add_flags, load, option
 from dreamfleet.common.cli.global_config import GlobalConfig, add_global_flags, load_credentials
@@ -16,10 +22,15 @@ from dreamfleet.common.files.atomic_write import open_new
 from dreamfleet.common.host.resource_limits import raise_open_file_limit
 from dreamfleet.common.host.standard_streams import make_stderr_nonblocking
 from dreamfleet.common.host.stop_signals import SIGNALS
+from dreamfleet.common.printable import plural
+from dreamfleet.common.security.certificate_ledger import CHECK_INTERVAL, RevocationWatcher
 from dreamfleet.common.transport.network import DEFAULT_ENDPOINT, SECURED_ENDPOINT, Network
+from dreamfleet.common.transport.session import open_session, zenoh_config
 
 SUMMARY = "forward messages between coordinators and workers that connect here; it stores nothing and may be restarted"
 EXTRAS = ()
+SUMMARY_INTERVAL = 60.0  # seconds between two log lines about the sessions
+log = logging.getLogger("dreamfleet.router")
 
 
 @dataclass(frozen=True)
@@ -37,11 +48,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     add_flags(parser, RouterConfig)
     add_global_flags(parser, "join", "access_dir")
-    parser.add_argument(
-        "--print-config",
-        action="store_true",
-        help="print the configuration with which Zenoh's own zenohd does the same, and exit",
-    )
+    text = "print the configuration with which Zenoh's own zenohd does the same, and exit"
+    parser.add_argument("--print-config", action="store_true", help=text)
     parser.add_argument(
         "--write-config", type=Path, metavar="FILE.json5",
         help="write that to a new file of mode 600, with the join file's secrets, and exit",
@@ -50,10 +58,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Route until Ctrl-C or SIGTERM."""
-    from dreamfleet.common.addons.router.router import run_router
-    from dreamfleet.common.security.certificate_ledger import RevocationWatcher
-    from dreamfleet.common.transport.session import zenoh_config
-
     make_stderr_nonblocking()
     raise_open_file_limit()
     config = load(RouterConfig, "router", **args.sources)
@@ -80,10 +84,35 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def run_router(network: Network, stopped: Event, revocations: RevocationWatcher) -> None:
+    """Route messages between all connected sessions until `stopped`; `ConnectionFailedError` if it cannot listen.
+
+    Other routers in `network.connect` may start later, stop and return. `AccessError` once its own file is revoked or
+    expired.
+    """
+    with closing(open_session(network, timeout=None)) as session:
+        others = f"; linked to {', '.join(network.connect)} while it is reachable" if network.connect else ""
+        log.info("listening on %s%s", ", ".join(network.listen), others,
+                 extra={"facts": {"event": "begin", "listen": network.listen, "connect": network.connect}})  # fmt: skip
+        summary_at = monotonic() + SUMMARY_INTERVAL
+        while not stopped.wait(CHECK_INTERVAL):
+            revocations.reload_if_changed(monotonic())
+            revocations.check_own_file()
+            if monotonic() >= summary_at:
+                summary_at += SUMMARY_INTERVAL
+                _log_sessions(session)
+        _log_sessions(session)
+
+
+def _log_sessions(session: zenoh.Session) -> None:
+    found = Counter(str(each.whatami) for each in session.info.transports())
+    facts = {"event": "sessions", "clients": found["client"], "routers": found["router"]}
+    log.info("%s: %s, %s", plural(found.total(), "session"), plural(found["client"], "client"),
+             plural(found["router"], "router"), extra={"facts": facts})  # fmt: skip
+
+
 def _write_config(path: Path, network: Network) -> None:
     """Write zenohd's configuration to a file, with certificates and keys in it."""
-    from dreamfleet.common.transport.session import zenoh_config
-
     if path.suffix not in (".json", ".json5"):
         raise UsageError(f"--write-config {path}: zenohd knows what it reads by its name: end it in .json5")
     if network.credentials is not None and network.credentials.uses_passwords:

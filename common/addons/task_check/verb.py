@@ -8,15 +8,14 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from importlib.metadata import EntryPoint
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
 
+from dreamfleet.common.addons.task_check.task_check import TaskReport, try_task
+from dreamfleet.common.cli.key_values import ENVIRONMENT_EXAMPLE, parse_arguments
 from dreamfleet.common.cli.output import print_rows
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.packages import GYMNASIUM, PACKAGES, install_command, wrong_version
 from dreamfleet.common.printable import plural
-
-if TYPE_CHECKING:
-    from dreamfleet.common.addons.task_check.task_check import TaskReport
+from dreamfleet.common.protocol.tasks import check_task, is_self_describing, registered_tasks, written_name
 
 SUMMARY = "list the tasks that installed packages register, or check one as a run does before it begins"
 EXTRAS = ()
@@ -39,8 +38,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print one line per task, and exit 0 even if one cannot run; or check one, and exit 1 if it cannot be scored."""
-    from dreamfleet.common.protocol.tasks import is_self_describing, registered_tasks
-
     points = registered_tasks()
     if args.task in points and not is_self_describing(args.task):  # its runs need a world model
         points = {args.task: points[args.task]}
@@ -59,10 +56,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> int:
-    from dreamfleet.common.addons.task_check.task_check import try_task
-    from dreamfleet.common.cli.key_values import ENVIRONMENT_EXAMPLE, parse_arguments
-    from dreamfleet.common.protocol.tasks import check_task
-
     check_task(args.task)
     arguments = parse_arguments("--environment", args.environment, ENVIRONMENT_EXAMPLE)
     given = {"environment": arguments, "observation": list(args.observation)}
@@ -90,8 +83,6 @@ def _findings(found: TaskReport) -> Iterator[tuple[str, str]]:
 
 
 def _row(name: str, point: EntryPoint) -> dict[str, object]:
-    from dreamfleet.common.protocol.tasks import written_name
-
     distribution = "-" if point.dist is None else f"{point.dist.name} {point.dist.version}"
     shown = written_name(name)
     try:

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from dreamfleet.common.addons.analysis.learning import LearningCurve
 from dreamfleet.common.cli.command_line import SimpleVerb
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer
@@ -16,6 +17,7 @@ from dreamfleet.common.files.atomic_write import check_output_path, open_output
 from dreamfleet.common.host.add_ons import add_on
 from dreamfleet.common.printable import printable_lines
 from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.coordinator.addons.runs.citation import citation_facts, format_markdown
 
 MOST_IN_NAME = 3  # runs that name a picture
 
@@ -73,7 +75,6 @@ def _draw_one(args: argparse.Namespace, kind: str, out: Path) -> None:
 
 
 def _draw_learning(args: argparse.Namespace, out: Path) -> None:
-    from dreamfleet.common.addons.analysis.learning import LearningCurve
     from dreamfleet.coordinator.addons.runs.plot import learning_figure, published_scores, save_figure
 
     curves = []
@@ -96,8 +97,6 @@ def configure_receipt(parser: argparse.ArgumentParser) -> None:
 
 def write_receipt(args: argparse.Namespace) -> int:
     """Print or write what a paper cites of a run, as Markdown or as JSON."""
-    from dreamfleet.coordinator.addons.runs.citation import citation_facts, format_markdown
-
     if args.out is not None:
         check_output_path(args.out)
     with open_run(args.runs_dir, args.run_name) as stored, stored.verified_transaction():

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.addons.analysis.elites import RunArchive
+from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.client.equal_fitness import EqualFitness
 from dreamfleet.common.client.run_view import RunView
 from dreamfleet.common.errors import JournalError
@@ -129,8 +130,6 @@ def _identity(run: RunFolder) -> dict[str, Any]:
 
 def _function_facts(mean: NDArray[np.float32] | None, options: str) -> dict[str, str]:
     """The arguments of a function that the reported mean of its run stands for."""
-    from dreamfleet.common.artifacts.objective import Objective
-
     objective = Objective.parse(options)
     values = f"the function's own; {'smaller' if objective.minimise else 'larger'} ones are better"
     found = "-" if mean is None else ", ".join(f"{each:z.8g}" for each in objective.decode(mean))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from dreamfleet.common.addons.analysis.elites import RunArchive, controller_of, tables
+from dreamfleet.common.addons.analysis.learning import LearningCurve
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError, JournalError, MissingExtraError, UsageError
@@ -115,8 +116,6 @@ class StoredRun(RunFolder, Displayed):
         ...     figure = run.plot()
         >>> figure.savefig("fitness.png")
         """
-        from dreamfleet.common.addons.analysis.learning import LearningCurve
-
         if kind not in PLOTS:
             raise UsageError(f"kind must be {' or '.join(PLOTS)}, not {kind!r}")
         _import("matplotlib", install_command("views"))

@@ -8,18 +8,17 @@ import re
 import sys
 from dataclasses import asdict
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, get_args
+from typing import get_args
 
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
 from dreamfleet.common.cli.output import add_json_flag, print_rows
+from dreamfleet.common.client.client import Client
+from dreamfleet.common.client.status import EventKind
 from dreamfleet.common.errors import ConnectionFailedError, UsageError
 from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.printable import join_some
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
-
-if TYPE_CHECKING:
-    from dreamfleet.common.client.client import Client
 
 SUMMARY = (
     "list what happened to a run: recent events of a live one's workers and jobs (given, seen, lost, accepted, ...), "
@@ -70,8 +69,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    from dreamfleet.common.client.status import EventKind
-
     if args.job is not None and not re.fullmatch(r"\d{1,12}/\d{1,12}", args.job):
         raise UsageError(f"--job {args.job!r}: write generation/index, such as 3/0")
     if args.worker is not None and not re.fullmatch(r"[A-Za-z0-9._/-]+", args.worker):
@@ -83,8 +80,6 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _print_live(args: argparse.Namespace) -> int:
-    from dreamfleet.common.client.client import Client
-
     with Client(resolve_network(args)) as client:
         events, total = client.events(args.run_name, args.worker or "", args.job or "", args.what)
         if args.worker is not None and not events and not args.what:

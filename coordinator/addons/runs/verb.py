@@ -24,6 +24,8 @@ from dreamfleet.common.runs.run_paths import ARCHIVE as ARCHIVE_FOLDER
 from dreamfleet.common.runs.run_paths import check_movable, reporting_folder_errors, resume_command, run_paths
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.transport.network import SECURED_PREFIX
+from dreamfleet.coordinator.addons.runs.backup import back_up
+from dreamfleet.coordinator.addons.runs.export import export_csv, export_parquet, export_tensorboard
 from dreamfleet.coordinator.addons.runs.run_details import (
     generation_rows,
     run_document,
@@ -32,6 +34,8 @@ from dreamfleet.coordinator.addons.runs.run_details import (
     setting_rows,
     unused_settings,
 )
+from dreamfleet.coordinator.settings.resume_settings import stored_network
+from dreamfleet.coordinator.storage.kept_revocations import REVOKED
 
 DROP_ORDER = (
     "created",
@@ -142,10 +146,6 @@ def configure_backup(parser: argparse.ArgumentParser) -> None:
 
 def back_up_run(args: argparse.Namespace) -> int:
     """Copy a run and read the copy; the run may be served meanwhile."""
-    from dreamfleet.coordinator.addons.runs.backup import back_up
-    from dreamfleet.coordinator.settings.resume_settings import stored_network
-    from dreamfleet.coordinator.storage.kept_revocations import REVOKED
-
     target = args.to / args.run_name
     with open_run(args.runs_dir, args.run_name) as source:
         back_up(source, target)
@@ -201,8 +201,6 @@ def configure_export(parser: argparse.ArgumentParser) -> None:
 
 def export_run(args: argparse.Namespace) -> int:
     """Write a run's journal as tables, and print the files' paths."""
-    from dreamfleet.coordinator.addons.runs.export import export_csv, export_parquet, export_tensorboard
-
     kinds = {"csv": export_csv, "parquet": export_parquet, "tensorboard": export_tensorboard}
     if args.run_name.endswith(f".{args.kind}"):
         command = f"dreamfleet runs export RUN --{args.kind} --out FOLDER"

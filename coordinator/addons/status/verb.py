@@ -9,19 +9,23 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from time import sleep
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
+
+from rich.console import Console
+from rich.live import Live
 
 from dreamfleet.common.cli.global_config import add_global_flags, add_run_argument, resolve_network
 from dreamfleet.common.cli.output import print_rows
+from dreamfleet.common.client.client import Client
+from dreamfleet.common.client.run_view import LiveRunView
+from dreamfleet.common.client.status import Status, read_status
 from dreamfleet.common.errors import ConnectionFailedError
+from dreamfleet.common.printable import one_line, plural
+from dreamfleet.common.runs.lookup import naming_the_stored_run
+from dreamfleet.common.runs.records import StoredGeneration, format_mean
 from dreamfleet.common.schema.validation import MalformedError
-
-if TYPE_CHECKING:
-    from dreamfleet.common.client.client import Client
-    from dreamfleet.common.client.status import Status
-    from dreamfleet.common.runs.records import StoredGeneration
-    from dreamfleet.common.transport.network import Network
-    from dreamfleet.coordinator.addons.status.status_panel import RunPanel
+from dreamfleet.common.transport.network import Network
+from dreamfleet.coordinator.addons.status.status_panel import RunPanel
 
 T = TypeVar("T")
 SUMMARY = "show a run's status: generation, population, best, workers, throughput, redundant work"
@@ -45,9 +49,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the status; if several runs are live and none is named, one line per run."""
-    from dreamfleet.common.client.client import Client
-    from dreamfleet.common.runs.lookup import naming_the_stored_run
-
     if args.watch:
         return _watch(resolve_network(args), args.run_name, as_json=args.json)
     with naming_the_stored_run(args.runs_dir, args.run_name), Client(resolve_network(args)) as client:
@@ -68,19 +69,12 @@ def run(args: argparse.Namespace) -> int:
 
 def _can_redraw() -> bool:
     """Whether the terminal can redraw; a dumb one would show nothing until the end."""
-    from rich.console import Console
-
     console = Console()
     return sys.stdout.isatty() and not console.is_dumb_terminal
 
 
 def print_runs(documents: Sequence[dict[str, Any]]) -> None:
     """One line per run; an unreadable status is a note."""
-    from dreamfleet.common.client.run_view import LiveRunView
-    from dreamfleet.common.client.status import read_status
-    from dreamfleet.common.printable import plural
-    from dreamfleet.common.runs.records import format_mean
-
     views = []
     for document in documents:
         try:
@@ -105,8 +99,6 @@ def print_runs(documents: Sequence[dict[str, Any]]) -> None:
 
 def _watch(network: Network, name: str | None, *, as_json: bool) -> int:
     """Show the status until the coordinator leaves; wait while it does not answer."""
-    from dreamfleet.common.client.client import Client
-
     show = _print_json_lines if as_json else _show_live if _can_redraw() else _print_changes
     with _retry_until_answered(lambda: Client(network)) as client:
         return show(client, name or str(_retry_until_answered(client.document)["run"]))
@@ -143,10 +135,6 @@ def _print_json_lines(client: Client, name: str) -> int:
 
 
 def _show_live(client: Client, name: str) -> int:
-    from rich.live import Live
-
-    from dreamfleet.common.client.status import read_status
-
     panels = _PanelBuilder(client, fitted=True)
     with Live(refresh_per_second=4, vertical_overflow="crop") as live:
         for document in _follow_documents(client, name):
@@ -156,12 +144,6 @@ def _show_live(client: Client, name: str) -> int:
 
 def _print_changes(client: Client, name: str) -> int:
     """Print a line whenever generation, evaluations, state or workers change; at the end the panel."""
-    from rich.console import Console
-
-    from dreamfleet.common.client.run_view import LiveRunView
-    from dreamfleet.common.client.status import read_status
-    from dreamfleet.common.printable import one_line
-
     shown = None
     for status in map(read_status, _follow_documents(client, name)):
         now = status.state, status.generation.number, status.evaluations, status.workers.present
@@ -183,8 +165,6 @@ class _PanelBuilder:
 
     def build(self, status: Status) -> RunPanel:
         """The panel of this status."""
-        from dreamfleet.coordinator.addons.status.status_panel import RunPanel
-
         whole = replace(_with_all_workers(self._client, status), recent=tuple(self._full_history(status)))
         return RunPanel(whole, self._client.worker_flags, fitted=self._fitted)
 

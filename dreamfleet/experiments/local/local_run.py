@@ -13,6 +13,7 @@ from pathlib import Path
 from random import SystemRandom
 from typing import Any
 
+from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, StoppedError, UsageError
 from dreamfleet.common.files.regular_files import path_exists
@@ -22,6 +23,7 @@ from dreamfleet.common.host.stop_signals import Stop, signals_deferred
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.common.transport.network import Network, wait_for_listener
+from dreamfleet.coordinator.settings import run_setup
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.experiments.local import command_lines
@@ -216,9 +218,6 @@ def parse_run_flags(flags: Sequence[str], sources: Mapping[str, Any], verb: str)
     `sources` are those of `verb`, as `complete_arguments` left them. `UsageError` for flags that `verb` sets itself,
     for wrong ones, and where none sets a limit.
     """
-    from dreamfleet.common.cli.command_line import build_parser
-    from dreamfleet.coordinator.settings import run_setup
-
     try:
         parsed = build_parser("coordinator", run_setup).parse_all(list(flags))
     except UsageError as error:
@@ -233,8 +232,6 @@ def parse_run_flags(flags: Sequence[str], sources: Mapping[str, Any], verb: str)
 
 def load_parsed_flags(parsed: argparse.Namespace, sources: Mapping[str, Any]) -> tuple[RunConfig, LimitsConfig]:
     """What a run is and when it ends, by parsed flags of `coordinator` and the `sources` of another verb."""
-    from dreamfleet.coordinator.settings import run_setup
-
     args = argparse.Namespace(sources={**sources, "flags": parsed}, given=frozenset(vars(parsed)))
     return run_setup.load_run_config(args, base={})
 

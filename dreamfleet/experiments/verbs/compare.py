@@ -8,8 +8,20 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from dreamfleet.common.addons.analysis.comparison import (
+    CORE_HOURS,
+    ComparedRun,
+    EqualBudget,
+    EvaluatedMean,
+    are_comparable,
+    at_equal_budget,
+    budget_name,
+    difference,
+    differing_settings,
+    paired_scores,
+)
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import UsageError
@@ -22,10 +34,10 @@ from dreamfleet.common.runs.records import count_episodes, format_mean, with_err
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.score_words import score_word
+from dreamfleet.experiments.sweep import summary
+from dreamfleet.experiments.sweep.folder import find_sweep
+from dreamfleet.experiments.verbs.sweep import print_settings
 from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport, read_evaluation_report
-
-if TYPE_CHECKING:
-    from dreamfleet.common.addons.analysis.comparison import ComparedRun, EqualBudget, EvaluatedMean
 
 SUMMARY = (
     "compare runs (settings that differ, scores at equal steps and core-hours, confirmed scores), reports of "
@@ -47,8 +59,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compare files as reports and other names as runs or sweeps, and note which of them it was."""
-    from dreamfleet.experiments.sweep.folder import find_sweep
-
     if any(find_sweep(args.runs_dir, name) for name in args.names):
         return _compare_sweeps(args, list(dict.fromkeys(args.names)))
     files = [name for name in args.names if is_file(Path(name))]
@@ -69,10 +79,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _compare_sweeps(args: argparse.Namespace, names: Sequence[str]) -> int:
     """Print the mean of each setting over its seeds; a run beside a sweep is a setting of its own."""
-    from dreamfleet.experiments.sweep import summary
-    from dreamfleet.experiments.sweep.folder import find_sweep
-    from dreamfleet.experiments.verbs.sweep import print_settings
-
     results: list[summary.RunResult] = []
     for name in names:
         folder = find_sweep(args.runs_dir, name)
@@ -123,13 +129,6 @@ def _warn(first: Path, base: EvaluationReport, path: Path, other: EvaluationRepo
 
 def _compare_runs(args: argparse.Namespace, names: Sequence[str]) -> int:
     """Print settings that differ, scores at equal budgets, and differences from the first run."""
-    from dreamfleet.common.addons.analysis.comparison import (
-        ComparedRun,
-        are_comparable,
-        at_equal_budget,
-        differing_settings,
-    )
-
     if len(names) < 2:
         raise UsageError(f"{names[0]} is one run: give another to compare it with")
     sides = []
@@ -180,8 +179,6 @@ def _run_row(side: ComparedRun) -> dict[str, object]:
 
 
 def _format_budget(sides: Sequence[ComparedRun], equal: EqualBudget) -> str:
-    from dreamfleet.common.addons.analysis.comparison import CORE_HOURS, budget_name
-
     spent = f"{equal.spent:.3g}" if equal.what == CORE_HOURS else f"{equal.spent:,.0f}"
     parts = [f"{side.name} {_format_evaluation(look)}" for side, look in zip(sides, equal.evaluated_means, strict=True)]
     return f"at {spent} {budget_name(sides, equal.what)}: {', '.join(parts)}"
@@ -195,8 +192,6 @@ def _format_evaluation(look: EvaluatedMean | None) -> str:
 
 def _run_differences(sides: Sequence[ComparedRun], equal: Sequence[EqualBudget]) -> Iterator[dict[str, Any]]:
     """Each run less the first: at equal budgets, then of confirmed scores."""
-    from dreamfleet.common.addons.analysis.comparison import difference, paired_scores
-
     for of, side, one, other in paired_scores(sides, equal):
         found = difference(one, other)
         if isinstance(found, PairedDifference):

@@ -5,18 +5,21 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from rich.console import Console
 
 from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
+from dreamfleet.common.errors import StoppedError
+from dreamfleet.common.files.locks import folder_lock
 from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_signals
 from dreamfleet.common.printable import plural
+from dreamfleet.experiments.contrast import summary
 from dreamfleet.experiments.contrast.config import KINDS, RUN_FLAGS, SEEDS, Contrast
-
-if TYPE_CHECKING:
-    from dreamfleet.experiments.contrast.summary import TrialResult
-    from dreamfleet.experiments.contrast.trials import Trials
+from dreamfleet.experiments.contrast.summary import TrialResult
+from dreamfleet.experiments.contrast.trials import LOCK, Trials
+from dreamfleet.experiments.local.local_run import LocalFleet, parse_run_flags
 
 SUMMARY = "train kinds of MDN-RNNs on equal data, several seeds each, evolve in each one's dream, and compare them"
 EXTRAS = ("train",)
@@ -49,10 +52,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 @interrupted_by_signals()
 def run(args: argparse.Namespace) -> int:
     """Run all trials that are left, and compare them."""
-    from dreamfleet.common.files.locks import folder_lock
-    from dreamfleet.experiments.contrast.trials import LOCK, Trials
-    from dreamfleet.experiments.local.local_run import LocalFleet, parse_run_flags
-
     kinds = tuple((name, flags) for name, flags in args.kind) or KINDS
     contrast = Contrast(kinds, tuple(args.seeds), args.mdnrnn_flags, args.run_flags)
     parse_run_flags(contrast.run_flags_in(FIRST_WORLD), args.sources, "lab contrast")  # wrong flags end it now
@@ -66,10 +65,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_trials(trials: Trials, contrast: Contrast) -> list[TrialResult]:
-    from rich.console import Console
-
-    from dreamfleet.common.errors import StoppedError
-
     console = Console(stderr=True, highlight=False)
     outcomes: list[TrialResult] = []
     try:
@@ -84,8 +79,6 @@ def _run_trials(trials: Trials, contrast: Contrast) -> list[TrialResult]:
 
 
 def _print_results(args: argparse.Namespace, outcomes: list[TrialResult]) -> None:
-    from dreamfleet.experiments.contrast import summary
-
     found, means = list(summary.differences(outcomes)), summary.means(outcomes)
     if args.json:
         parts = {

@@ -6,29 +6,38 @@ import argparse
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from rich.console import Console
+from rich.markup import escape
+
+from dreamfleet.common.artifacts.actions import one_hot
+from dreamfleet.common.artifacts.bundle import Bundle
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.artifacts.world_facts import WorldFacts
 from dreamfleet.common.cli.config import add_flags, configured_values, load
 from dreamfleet.common.cli.global_config import add_global_flags, load_credentials, security_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next, print_rows
 from dreamfleet.common.cli.presets import default_run_preset
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.files.locks import folder_lock
 from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.host.packages import check_modules
-from dreamfleet.common.host.stop_signals import interrupted_by_signals, stop_on_signals
+from dreamfleet.common.host.stop_signals import Stop, interrupted_by_signals, stop_on_signals
 from dreamfleet.common.printable import plural
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, DEFAULT_HORIZON, RunConfig, default_world
 from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.network import NetworkConfig
+from dreamfleet.coordinator.settings.start import find_start
+from dreamfleet.experiments.iteration import summary
 from dreamfleet.experiments.iteration.config import IterateConfig
-
-if TYPE_CHECKING:
-    from dreamfleet.common.artifacts.bundle import Bundle
-    from dreamfleet.common.host.stop_signals import Stop
-    from dreamfleet.experiments.iteration.layout import IterationFolder
-    from dreamfleet.experiments.iteration.ledger import IterationLedger
-    from dreamfleet.experiments.iteration.runner import Iteration
+from dreamfleet.experiments.iteration.layout import IterationFolder
+from dreamfleet.experiments.iteration.ledger import FinishedPhase, IterationLedger
+from dreamfleet.experiments.iteration.phases import find_init
+from dreamfleet.experiments.iteration.plan import INIT, Phase
+from dreamfleet.experiments.iteration.runner import Iteration
+from dreamfleet.experiments.iteration.summary import format_entry
+from dreamfleet.experiments.local.local_run import LocalFleet, parse_run_flags, task_flags
 
 SUMMARY = (
     "make world models and evolve in their dreams in turn; each world model learns from drives of the last evolution"
@@ -61,9 +70,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 @interrupted_by_signals()
 def run(args: argparse.Namespace) -> int:
     """Run the phases that are left, and print what each round reached."""
-    from dreamfleet.common.files.locks import folder_lock
-    from dreamfleet.experiments.iteration.layout import IterationFolder
-
     check_modules(PACKAGES)
     layout = IterationFolder(args.data)
     with folder_lock(layout.lock, "iteration"), stop_on_signals() as stop:
@@ -74,12 +80,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Stop) -> Iteration:
-    from dreamfleet.experiments.iteration.ledger import IterationLedger
-    from dreamfleet.experiments.iteration.phases import find_init
-    from dreamfleet.experiments.iteration.plan import INIT, Phase
-    from dreamfleet.experiments.iteration.runner import Iteration
-    from dreamfleet.experiments.local.local_run import LocalFleet, parse_run_flags, task_flags
-
     begun = IterationLedger.load(layout.ledger)
     config = load(IterateConfig, "iterate", base=begun.settings if begun else None, **args.sources)
     if is_file(Path(config.init)):
@@ -129,9 +129,6 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
 
 def _check_run(config: IterateConfig, run: RunConfig, layout: IterationFolder) -> None:
     """Check that a round's run can begin, in the shipped world model or in that of `--init`."""
-    from dreamfleet.coordinator.settings.start import find_start
-    from dreamfleet.experiments.iteration.phases import find_init
-
     run = replace(run, recorded=0.0)  # a bundle need not hold recorded states yet
     if not config.init:
         settings = freeze(run, _stand_in(config))
@@ -148,11 +145,6 @@ def _check_run(config: IterateConfig, run: RunConfig, layout: IterationFolder) -
 
 def _stand_in(config: IterateConfig) -> Bundle:
     """A world model for what a run's settings must fit: the shipped one, as if it were of the iteration's world."""
-    from dreamfleet.common.artifacts.actions import one_hot
-    from dreamfleet.common.artifacts.bundle import Bundle
-    from dreamfleet.common.artifacts.bundle_store import find_bundle
-    from dreamfleet.common.artifacts.world_facts import WorldFacts
-
     shipped = find_bundle(DEFAULT_BUNDLE)
     if config.task in ("", shipped.manifest.task):
         return shipped
@@ -161,13 +153,6 @@ def _stand_in(config: IterateConfig) -> Bundle:
 
 
 def _run_phases(iteration: Iteration, layout: IterationFolder) -> None:
-    from rich.console import Console
-    from rich.markup import escape
-
-    from dreamfleet.experiments.iteration.ledger import FinishedPhase
-    from dreamfleet.experiments.iteration.plan import Phase
-    from dreamfleet.experiments.iteration.summary import format_entry
-
     console = Console(stderr=True, highlight=False)
     if finished := iteration.ledger.finished:
         console.print(f"finished: {plural(len(finished), 'phase')}, the last is {finished[-1]}", markup=False)
@@ -189,8 +174,6 @@ def _run_phases(iteration: Iteration, layout: IterationFolder) -> None:
 
 
 def _print_results(args: argparse.Namespace, layout: IterationFolder, ledger: IterationLedger) -> None:
-    from dreamfleet.experiments.iteration import summary
-
     rounds = summary.describe_rounds(layout, ledger)
     # The last round may be unfinished, with a model that no gate has judged yet.
     counts = next(each["evolved_in"] for each in reversed(rounds) if each["evolved_in"] is not None)

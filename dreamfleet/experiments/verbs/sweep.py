@@ -7,23 +7,33 @@ import sys
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.cli.config import add_flags, load, read_table, read_toml
 from dreamfleet.common.cli.global_config import add_global_flags, load_credentials, security_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import StoppedError, UsageError
+from dreamfleet.common.files.locks import folder_lock
+from dreamfleet.common.host.processes import shell_command
+from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import Stop, interrupted_by_signals, stop_on_signals
 from dreamfleet.common.printable import plural
+from dreamfleet.common.transport.network import Network
+from dreamfleet.coordinator.settings import run_setup
 from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, RunConfig
+from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
+from dreamfleet.experiments.local.local_run import free_port, load_parsed_flags
+from dreamfleet.experiments.started_run import check_settings, flag_words
+from dreamfleet.experiments.sweep import summary
+from dreamfleet.experiments.sweep.display import showing
+from dreamfleet.experiments.sweep.folder import FIGURE, StoredSweep, SweepFolder
 from dreamfleet.experiments.sweep.plan import Sweep, SweepOptions, parse_vary, read_vary
-
-if TYPE_CHECKING:
-    from dreamfleet.experiments.sweep.folder import StoredSweep, SweepFolder
-    from dreamfleet.experiments.sweep.runner import RunProgress, SweepFleet
-    from dreamfleet.experiments.sweep.summary import RunResult
+from dreamfleet.experiments.sweep.runner import RunProgress, SweepFleet, SweepRunner
+from dreamfleet.experiments.sweep.summary import RunResult
 
 SUMMARY = "evolve with several seeds and settings on one fleet, and compare the settings"
 EXTRAS: tuple[str, ...] = ()
@@ -72,9 +82,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 @interrupted_by_signals()
 def run(args: argparse.Namespace) -> int:
     """Serve a new sweep or resume one, then compare its settings."""
-    from dreamfleet.common.files.locks import folder_lock
-    from dreamfleet.experiments.sweep.folder import StoredSweep, SweepFolder
-
     file = read_toml(args.file, ("vary", "flags"), ("run", "parallel", "workers", "listen", "connect"))
     if args.resume:
         _refuse_settings(args, file)
@@ -108,8 +115,6 @@ def _options(args: argparse.Namespace, file: Mapping[str, Any], kept: SweepOptio
 
 
 def _new_sweep(args: argparse.Namespace, file: Mapping[str, Any]) -> Sweep:
-    from dreamfleet.experiments.started_run import check_settings, flag_words
-
     name = args.run_name or file.get("run")
     if not isinstance(name, str):
         raise UsageError("name the sweep: give --run NAME, or run = 'NAME' in the file")
@@ -127,10 +132,6 @@ def check_runs(sweep: Sweep, sources: Mapping[str, Any]) -> tuple[str, ...]:
 
     `sources` are those of the verb, as `complete_arguments` left them.
     """
-    from dreamfleet.common.cli.command_line import build_parser
-    from dreamfleet.coordinator.settings import run_setup
-    from dreamfleet.experiments.local.local_run import load_parsed_flags
-
     given = {*sweep.vary, *(flag.removeprefix("--").partition("=")[0] for flag in sweep.flags if flag[:2] == "--")}
     if taken := sorted(given & set(OWN)):
         raise UsageError(f"{taken[0]} is no setting that a sweep can give its runs: it sets it itself")
@@ -154,9 +155,6 @@ def check_runs(sweep: Sweep, sources: Mapping[str, Any]) -> tuple[str, ...]:
 
 def _check_settings(config: RunConfig, *, has_start: bool) -> list[str]:
     """Check the settings together; return the tasks that they name."""
-    from dreamfleet.common.artifacts.bundle_store import find_bundle
-    from dreamfleet.coordinator.settings.freezing import freeze
-
     bundle = None if config.needs_no_bundle else find_bundle(config.bundle or DEFAULT_BUNDLE)
     if not has_start:  # a start point may name another world model
         freeze(config, bundle)
@@ -177,11 +175,6 @@ def _refuse_settings(args: argparse.Namespace, file: Mapping[str, Any]) -> None:
 
 
 def _fleet(args: argparse.Namespace, options: SweepOptions) -> SweepFleet:
-    from dreamfleet.common.host.resource_limits import usable_cores
-    from dreamfleet.common.transport.network import Network
-    from dreamfleet.experiments.local.local_run import free_port
-    from dreamfleet.experiments.sweep.runner import SweepFleet
-
     if options.connect:
         credentials = load_credentials(args, ("coordinator",))
         network = Network(connect=options.connect, credentials=credentials)
@@ -197,10 +190,6 @@ def _fleet(args: argparse.Namespace, options: SweepOptions) -> SweepFleet:
 def _serve(
     args: argparse.Namespace, stored: StoredSweep, folder: SweepFolder, fleet: SweepFleet, stop: Stop
 ) -> list[RunProgress]:
-    from dreamfleet.common.host.processes import shell_command
-    from dreamfleet.experiments.sweep.display import showing
-    from dreamfleet.experiments.sweep.runner import SweepRunner
-
     sweep = stored.sweep
     runs, workers = plural(len(sweep.runs), "run"), plural(fleet.workers, "worker")
     join = shell_command("worker", "--any", "--connect", fleet.endpoint)
@@ -219,8 +208,6 @@ def _serve(
 
 def _report(args: argparse.Namespace, sweep: Sweep, folder: SweepFolder, progress: list[RunProgress]) -> int:
     """Print the mean of each setting, write the figure, and name what failed."""
-    from dreamfleet.experiments.sweep import summary
-
     results = summary.read_results(args.runs_dir, sweep.runs)
     failed, left = ([each for each in progress if each.state == state] for state in ("failed", "left open"))
     figure = _draw(folder, results)
@@ -242,8 +229,6 @@ def _report(args: argparse.Namespace, sweep: Sweep, folder: SweepFolder, progres
 
 def print_settings(results: list[RunResult]) -> None:
     """Print each setting's mean over its runs, and which settings gave the same."""
-    from dreamfleet.experiments.sweep import summary
-
     shown = [each.in_values for each in results]
     if (kind := summary.judged_by(shown)) is None:
         return
@@ -261,8 +246,6 @@ def print_settings(results: list[RunResult]) -> None:
 
 def _draw(folder: SweepFolder, results: list[RunResult]) -> Path | None:
     """The figure's path; `None` if there is nothing to draw, or nothing to draw with."""
-    from dreamfleet.experiments.sweep.folder import FIGURE
-
     path = folder.path / FIGURE
     try:
         from dreamfleet.experiments.sweep.figure import plot_sweep

@@ -11,7 +11,11 @@ from dreamfleet.common.cli.config import add_flags
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag
 from dreamfleet.common.protocol.keys import check_run_name
+from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.coordinator.settings.network import NetworkConfig
+from dreamfleet.coordinator.verbs.coordinator import ExitReport, build_request, serve_request
+from dreamfleet.experiments.local.local_run import task_flags
+from dreamfleet.experiments.rerun import Rerun
 
 SUMMARY = (
     "re-run the run that a controller came from, by its provenance, and compare its reported controller bit by bit"
@@ -35,11 +39,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the run for as many generations; exit 1 if it then reports another controller."""
-    from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
-    from dreamfleet.coordinator.verbs.coordinator import ExitReport, build_request, serve_request
-    from dreamfleet.experiments.local.local_run import task_flags
-    from dreamfleet.experiments.rerun import Rerun
-
     controller, beside = find_controller(args.controller, args.runs_dir)
     again = Rerun.of(controller, find_bundle_of(controller, args.bundle, beside))
     folder = args.runs_dir / check_run_name(args.run_name or f"{Path(args.controller).stem}-again")

@@ -19,7 +19,7 @@ import pytest
 
 from dreamfleet.common.addons.access import authority
 from dreamfleet.common.addons.access.authority import Authority, save_ledger, with_revoked
-from dreamfleet.common.addons.router import router
+from dreamfleet.common.addons.router import verb as router
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import AccessError, DreamfleetError, UsageError
 from dreamfleet.common.security import certificate_ledger
