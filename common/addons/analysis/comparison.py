@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from dreamfleet.common.addons.analysis.learning import LearningCurve, Point
+from dreamfleet.common.addons.analysis.learning import Point, points_of, world_of
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.function_values import is_minimised, value_of
 from dreamfleet.common.protocol.tasks import is_function_task
@@ -50,13 +50,12 @@ class ComparedRun:
         """Read a run's journal."""
         with run.read_transaction():
             evaluations, confirmed = run.evaluations(), run.confirmation()
-            curve = LearningCurve.of(run) if evaluations else None
             evaluated_means = tuple(
                 EvaluatedMean(each.generation, point, run.scores(each.generation))
-                for each, point in zip(evaluations, curve.points if curve else (), strict=True)
+                for each, point in zip(evaluations, points_of(run, as_values=False), strict=True)
             )
             scores = {} if confirmed is None else run.scores(confirmed.generation, confirming=True)
-            world = None if curve is None else curve.world
+            world = world_of(run) if evaluations else None
             return cls(
                 run.name, run.settings, world, run.total_effort(), run.start_effort(),
                 evaluated_means, confirmed, scores,

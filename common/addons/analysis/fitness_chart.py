@@ -4,31 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
+from dreamfleet.common.addons.analysis.learning import Point
 from dreamfleet.common.addons.analysis.scored_history import scored_history
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.function_values import is_minimised, spans_decades, value_of
 from dreamfleet.common.protocol.tasks import DREAM, is_function_task
-from dreamfleet.common.runs.records import in_values
+from dreamfleet.common.runs.records import StoredConfirmation, StoredEvaluation, in_values
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import BegunStage, begun_stages
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.score_words import score_word_of_run
 
-
-class ScoreWithError(Protocol):
-    """A mean that has a standard error, or none of one episode."""
-
-    @property
-    def error(self) -> float | None:
-        """The standard error."""
-
-
+Judged = Point | StoredEvaluation | StoredConfirmation
 # Of a confirmed score: a white edge sets it apart from lines and error bars behind it, and no edge of a panel cuts it.
 STAR: dict[str, Any] = {
     "markersize": 14, "markeredgecolor": "white", "markeredgewidth": 1, "capsize": 4, "zorder": 5, "clip_on": False
@@ -134,7 +127,7 @@ def _break_lines(jumps: Sequence[int], number: ArrayLike, *values: ArrayLike) ->
     return [np.insert(np.asarray(each, dtype=np.float64), places, np.nan) for each in (number, *values)]
 
 
-def error_bars(found: Iterable[ScoreWithError]) -> list[float]:
+def error_bars(found: Iterable[Judged]) -> list[float]:
     """The lengths of error bars; a score without a standard error has no bar."""
     return [np.nan if each.error is None else each.error for each in found]
 

@@ -6,15 +6,15 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
-from dreamfleet.common.addons.analysis.learning import LearningCurve
+from dreamfleet.common.addons.analysis.learning import world_of
 from dreamfleet.common.cli.command_line import SimpleVerb
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, open_output
-from dreamfleet.common.host.add_ons import add_on
 from dreamfleet.common.printable import printable_lines
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.coordinator.addons.runs.citation import citation_facts, format_markdown
@@ -43,17 +43,21 @@ def configure_plot(parser: argparse.ArgumentParser) -> None:
 
 def plot_runs(args: argparse.Namespace) -> int:
     """Draw, and print the picture's path."""
-    from dreamfleet.coordinator.addons.runs.plot import KINDS
+    from dreamfleet.coordinator.addons.runs.plot import KINDS, draw_runs, save_figure
 
     kind = args.kind or ("fitness" if len(args.run_names) == 1 else "learning")
     out = args.out or _picture_name(args.run_names, kind)
     if out.suffix not in KINDS:
         raise UsageError(f"--out {out}: give a name that ends in {' or '.join(KINDS)}")
     check_output_path(out)
-    if kind == "learning":
-        _draw_learning(args, out)
-    else:
-        _draw_one(args, kind, out)
+    with ExitStack() as stack:
+        runs = [stack.enter_context(open_run(args.runs_dir, name)) for name in dict.fromkeys(args.run_names)]
+        for each in runs:
+            stack.enter_context(each.read_transaction())
+        if kind == "learning" and len(worlds := sorted({world_of(each) for each in runs})) > 1:
+            note = f"these runs are in different worlds ({', '.join(worlds)}): their scores do not compare"
+            print(f"note: {note}", file=sys.stderr)
+        save_figure(draw_runs(runs, kind), out)
     print_answer(args, str(out), picture=out, runs=args.run_names)
     return 0
 
@@ -63,29 +67,6 @@ def _picture_name(runs: Sequence[str], what: str) -> Path:
     names = list(dict.fromkeys(runs))
     more = [f"and-{len(names) - MOST_IN_NAME}"] if len(names) > MOST_IN_NAME else []
     return Path("-".join((*names[:MOST_IN_NAME], *more, f"{what}.png")))
-
-
-def _draw_one(args: argparse.Namespace, kind: str, out: Path) -> None:
-    from dreamfleet.coordinator.addons.runs.plot import fitness_figure, save_figure
-
-    if len(args.run_names) > 1:
-        raise UsageError(f"--kind {kind} draws one run: name one")
-    with open_run(args.runs_dir, args.run_names[0]) as stored, stored.read_transaction():
-        save_figure(add_on("archive-figure")(stored) if kind == "archive" else fitness_figure(stored), out)
-
-
-def _draw_learning(args: argparse.Namespace, out: Path) -> None:
-    from dreamfleet.coordinator.addons.runs.plot import learning_figure, published_scores, save_figure
-
-    curves = []
-    for name in dict.fromkeys(args.run_names):
-        with open_run(args.runs_dir, name) as stored, stored.read_transaction():
-            curves.append(LearningCurve.of(stored))
-    worlds = sorted({each.world for each in curves})
-    if len(worlds) > 1:
-        names = ", ".join(worlds)
-        print(f"note: these runs are in different worlds ({names}): their scores do not compare", file=sys.stderr)
-    save_figure(learning_figure(curves, published_scores(curves)), out)
 
 
 def configure_receipt(parser: argparse.ArgumentParser) -> None:

@@ -103,7 +103,6 @@ def scalars_of(run: RunFolder, since: int = 0) -> Iterator[tuple[int, dict[str, 
 
 
 def _score(name: str, found: StoredEvaluation | StoredConfirmation) -> dict[str, float]:
-    """A mean's score, and its standard error if it has one."""
     error = {} if found.error is None else {f"score__{name}_error": found.error}
     return {f"score__{name}": found.mean, **error}
 
@@ -122,7 +121,6 @@ def rows_of(run: RunFolder, table: str) -> list[Row]:
 
 
 def _tables(run: RunFolder) -> Iterator[tuple[str, list[str], list[Row]]]:
-    """Name, columns and rows of each table with rows."""
     for name in TABLES:
         if rows := rows_of(run, name):
             yield name, columns_of(name), rows

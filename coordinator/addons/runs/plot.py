@@ -26,6 +26,7 @@ from dreamfleet.common.addons.analysis.fitness_chart import (
 from dreamfleet.common.addons.analysis.learning import LearningCurve
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import open_output
+from dreamfleet.common.host.add_ons import add_on
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.function_values import is_minimised, spans_decades
 from dreamfleet.common.protocol.tasks import DREAM, is_function_task
@@ -85,14 +86,9 @@ def fitness_figure(run: RunFolder) -> Figure:
     panels[0].set_ylabel("\n".join(label))
     if two:
         panels[1].set_ylabel("score in reality\n(whole episodes)")
-    size = (
-        SUBMITTED
-        if settings.is_external
-        else join_distinct(
-            f"{each.stage.settings.population} candidates x {plural(each.stage.settings.episodes, 'episode')}"
-            for each in stages
-        )
-    )
+    sizes = (each.stage.settings for each in stages)
+    own = join_distinct(f"{each.population} candidates x {plural(each.episodes, 'episode')}" for each in sizes)
+    size = SUBMITTED if settings.is_external else own
     _set_titles(panels[0], f"{run.name}: {settings.task.task}, {size}, seed {settings.seed}", _note(run))
     _add_legend(figure, handles, columns=2)
     return figure
@@ -111,17 +107,25 @@ def _value_axis(run: RunFolder, axes: Any) -> str:
     return f"value of the function ({goal}{', log scale' if axes.get_yscale() == 'log' else ''})"
 
 
+def draw_runs(runs: Sequence[RunFolder], kind: str) -> Figure:
+    """A picture: the `fitness` or the `archive` of one run, or the `learning` of several; `UsageError` for nothing."""
+    if kind == "learning":
+        curves = [LearningCurve.of(each) for each in runs]
+        return learning_figure(curves, published_scores(curves))
+    if len(runs) > 1:
+        raise UsageError(f"--kind {kind} draws one run: name one")
+    figure: Figure = add_on("archive-figure")(runs[0]) if kind == "archive" else fitness_figure(runs[0])
+    return figure
+
+
 def learning_figure(curves: Sequence[LearningCurve], marks: PublishedScores | None) -> Figure:
     """Evaluated scores over environment steps and core-hours, with published scores as `marks`: a matplotlib `Figure`.
-
-    Of a function its values, as `LearningCurve.in_values` has them.
 
     A published score of unknown steps is a horizontal line.
 
     Environment steps are all steps in reality: of candidates, kept rollouts, evaluations, and of the run that this one
     began from. The legend shows dreamt steps.
     """
-    curves = [each.in_values for each in curves]
     figure = ShownFigure(figsize=(11, 5.6), layout=ConstrainedLayoutEngine(w_pad=PAD, h_pad=PAD))
     over_steps, over_hours = figure.subplots(1, 2, sharey=True)
     one_world = len({each.world for each in curves}) == 1
@@ -189,17 +193,10 @@ def _scale(axes: Any) -> bool:
 def _draw_curve(axes: Any, curve: LearningCurve, name: str, colour: str, spent: Callable[[Effort], float]) -> None:
     """Plot evaluations as a line. The confirmed score is a hollow star, dotted to the same mean's evaluation."""
     points, last, reported = curve.points, curve.confirmed, curve.reported
-    axes.errorbar(
-        [spent(each.effort) for each in points],
-        [each.score for each in points],
-        error_bars(points),
-        fmt="o-",
-        color=colour,
-        markersize=4,
-        linewidth=1.2,
-        capsize=2,
-        label=f"{name}: {curve.total.describe(curve.world)}",
-    )
+    efforts, scores = [spent(each.effort) for each in points], [each.score for each in points]
+    label = f"{name}: {curve.total.describe(curve.world)}"
+    line = {"fmt": "o-", "markersize": 4, "linewidth": 1.2, "capsize": 2}
+    axes.errorbar(efforts, scores, error_bars(points), color=colour, label=label, **line)
     if last is None:
         return
     if reported is not None:

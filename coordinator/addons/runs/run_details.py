@@ -36,11 +36,6 @@ ROW = (
     "run", "created", "task", "generations", "mean", "best", "best_error", "confirmed", "confirmed_error", "classes",
     "state", "ended",
 )  # fmt: skip
-SCORES = (
-    "mean",
-    "best",
-    "confirmed",
-)  # of a row: the last generation's average, the best evaluation, the confirmed one
 FITNESS = ("mean", "std", "best", "worst")  # of a generation; none where all candidates failed
 Setting = tuple[str, str, bool]  # name, value, and whether it differs from its default
 

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from dreamfleet.common.addons.analysis.elites import RunArchive, controller_of, tables
-from dreamfleet.common.addons.analysis.learning import LearningCurve
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.errors import ControllerError, JournalError, MissingExtraError, UsageError
-from dreamfleet.common.host.add_ons import add_on
+from dreamfleet.common.errors import JournalError, MissingExtraError, UsageError
 from dreamfleet.common.host.packages import install_command
 from dreamfleet.common.printable import plural
 from dreamfleet.common.runs import run_folder, run_paths
+from dreamfleet.common.runs.lookup import load_controller_of
 from dreamfleet.common.runs.records import best_evaluation, format_mean, in_values
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.schema.display import Displayed
@@ -63,12 +62,7 @@ class StoredRun(RunFolder, Displayed):
 
     def controller(self) -> Controller:
         """The controller that the run reports; `ControllerError` before its first generation is closed."""
-        try:
-            return Controller.load(self.controller_path)
-        except ControllerError as error:
-            if self.history():
-                raise
-            raise ControllerError(f"run {self.name} has no controller before its first generation is closed") from error
+        return load_controller_of(self)
 
     def bundle(self) -> Bundle | None:
         """The run's own copy of its world model, for `evaluate` and `predict`; `None` if it has none."""
@@ -119,16 +113,10 @@ class StoredRun(RunFolder, Displayed):
         if kind not in PLOTS:
             raise UsageError(f"kind must be {' or '.join(PLOTS)}, not {kind!r}")
         _import("matplotlib", install_command("views"))
-        from dreamfleet.coordinator.addons.runs.plot import fitness_figure, learning_figure, published_scores
+        from dreamfleet.coordinator.addons.runs.plot import draw_runs
 
         with self.read_transaction():
-            if kind == "archive":
-                figure: Figure = add_on("archive-figure")(self)
-                return figure
-            if kind == "fitness":
-                return fitness_figure(self)
-            curves = [LearningCurve.of(self)]
-            return learning_figure(curves, published_scores(curves))
+            return draw_runs([self], kind)
 
     def _to_frame(self, package: str, table: str) -> Any:
         if table not in (*TABLES, ELITES):

@@ -99,7 +99,6 @@ def _print_live(args: argparse.Namespace) -> int:
 
 
 def _print_journal(args: argparse.Namespace) -> int:
-    """Print what happened to a run while nobody watched, the newest last."""
     with open_run(args.runs_dir, args.run_name) as stored, stored.read_transaction():
         events, failures = stored.events(), stored.failures()
     events = events[-(args.last or len(events) or 1) :]

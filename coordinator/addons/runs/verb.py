@@ -37,14 +37,8 @@ from dreamfleet.coordinator.addons.runs.run_details import (
 from dreamfleet.coordinator.settings.resume_settings import stored_network
 from dreamfleet.coordinator.storage.kept_revocations import REVOKED
 
-DROP_ORDER = (
-    "created",
-    "classes",
-    "sweep",
-    "task",
-    "average",
-    "best",
-)  # columns that a narrow terminal leaves out first
+# Columns that a narrow terminal leaves out first.
+DROP_ORDER = ("created", "classes", "sweep", "task", "average", "best")
 LAST_GENERATIONS = 20
 
 
@@ -112,15 +106,9 @@ def show_run(args: argparse.Namespace) -> int:
     shown = rows[-LAST_GENERATIONS:] if sys.stdout.isatty() else rows
     if len(shown) < len(rows):
         print(f"the last {LAST_GENERATIONS} of {len(rows)} generations; --json has all")
-    least = (
-        "seconds",
-        "worst",
-        "steps",
-        "std",
-        "sigma",
-        *(() if any(each["failed"] for each in rows) else ("failed",)),
-    )
-    print_rows(shown, right=tuple(rows[0]) if rows else (), drop_order=least)
+    least = () if any(each["failed"] for each in rows) else ("failed",)
+    order = ("seconds", "worst", "steps", "std", "sigma", *least)
+    print_rows(shown, right=tuple(rows[0]) if rows else (), drop_order=order)
     return 0
 
 
