@@ -158,7 +158,6 @@ class Authority:
 
     @contextmanager
     def _locked_ledger(self) -> Iterator[CertificateLedger]:
-        """Load the ledger and lock it against changes."""
         with ExitStack() as stack:
             try:
                 stack.enter_context(_locked(self._folder))

@@ -18,11 +18,8 @@ from dreamfleet.common.transport.network import SECURED_PREFIX, check_endpoint, 
 
 def configure_init(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `access init`."""
-    add_global_flags(
-        parser,
-        "access_dir",
-        texts={"access_dir": "the folder to make (default access); its holder decides who joins the fleet"},
-    )
+    text = "the folder to make (default access); its holder decides who joins the fleet"
+    add_global_flags(parser, "access_dir", texts={"access_dir": text})
     parser.add_argument(
         "--passwords", action="store_true",
         help="let hosts join by passwords derived from one secret, instead of by certificates",
@@ -129,10 +126,7 @@ def revoke_join_files(args: argparse.Namespace) -> int:
 
     found = Authority(args.global_config.access_dir).revoke(args.name, args.role)
     role, identity = found[0].role, found[0].identity
-    soon = (
-        "a coordinator with this --access-dir counts nothing of it from now on (2 s); "
-        if role == "worker" else ""
-    )  # fmt: skip
+    soon = "a coordinator with this --access-dir counts nothing of it from now on (2 s); " if role == "worker" else ""
     text = f"{role} {args.name} ({identity}) is revoked: {soon}routers let it do nothing from their next start on"
     print_answer(args, text, name=args.name, role=role, identity=identity, files=len(found))
     return 0

@@ -57,14 +57,9 @@ class RunArchive(EliteArchive):
     @property
     def facts(self) -> dict[str, Any]:
         """The archive as a plain dictionary."""
-        best = self.best
-        return {
-            "axes": [vars(axis) for axis in self.axes],
-            "cells": self.cells,
-            "filled": len(self.elites),
-            "qd_score": self.qd_score,
-            "best": None if best is None else {**vars(best), "cell": list(best.cell), "measures": list(best.measures)},
-        }
+        best, axes = self.best, [vars(axis) for axis in self.axes]
+        own = best and {**vars(best), "cell": list(best.cell), "measures": list(best.measures)}
+        return {"axes": axes, "cells": self.cells, "filled": len(self.elites), "qd_score": self.qd_score, "best": own}
 
     @property
     def description(self) -> str:

@@ -47,13 +47,11 @@ class Finding:
 def run_checks(runs_dir: Path, join: Path | None = None, task: str | None = None) -> list[Finding]:
     """Run all checks: of this module, of the join file and the task if any, and those in the entry points `GROUP`."""
     registered = [finding for point in entry_points(group=GROUP) for finding in point.load()()]
-    folders = [
-        _check_writable("cache", default_cache(), "everything"),
-        _check_writable("runs", runs_dir, "coordinator"),
-    ]
+    cache = _check_writable("cache", default_cache(), "everything")
+    runs = _check_writable("runs", runs_dir, "coordinator")
     joined = [] if join is None else [_check_join_file(join)]
     tried = [] if task is None else _check_task(task)
-    return [*_check_packages(), _check_box2d(), *_check_bundles(), *registered, *folders, *joined, *tried]
+    return [*_check_packages(), _check_box2d(), *_check_bundles(), *registered, cache, runs, *joined, *tried]
 
 
 def _check_task(task: str) -> Iterator[Finding]:

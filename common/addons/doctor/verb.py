@@ -7,7 +7,7 @@ import json
 import platform
 import sys
 
-from dreamfleet.common.addons.doctor.health import ABSENT, Finding, missing_for_role, run_checks
+from dreamfleet.common.addons.doctor.health import ABSENT, ROLES, Finding, missing_for_role, run_checks
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_rows
 from dreamfleet.common.host.fingerprint import fingerprint
@@ -16,13 +16,12 @@ from dreamfleet.common.printable import plural
 
 SUMMARY = "check this installation: versions, fingerprint, what each role lacks and the remedy"
 EXTRAS = ()
-ALL_ROLES = ("coordinator", "worker", "views", "train", "dashboard", "export")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument(
-        "--role", choices=ALL_ROLES, default="coordinator",
+        "--role", choices=ROLES, default="coordinator",
         help="exit 1 if this installation cannot play this role (default coordinator, which the others build on)",
     )  # fmt: skip
     parser.add_argument("--task", metavar="TASK", help="also check this task's environment, such as gym:LunarLander-v3")
@@ -33,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the report; exit 1 if `--role` cannot be played."""
     findings = run_checks(args.runs_dir, args.global_config.join, args.task)
-    roles = {role: missing_for_role(role, findings) for role in ALL_ROLES}
+    roles = {role: missing_for_role(role, findings) for role in ROLES}
     host = {"python": platform.python_version(), "platform": platform.platform(), "cores": usable_cores(),
             "fingerprint": fingerprint()}  # fmt: skip
     if args.json:

@@ -159,7 +159,6 @@ class LiveView:
                 )
 
     def _subscribe(self) -> None:
-        """Subscribe to a worker, if there is one."""
         self._search_at = monotonic() + RETRY_SECONDS
         chosen = self._choose_worker()
         if chosen is None:

@@ -200,7 +200,6 @@ class _Handlers:
             self._held -= sum(map(len, chunks))
 
     async def _ask(self, run: str, ask: Callable[[], Any]) -> Any:
-        """Ask the coordinator of `run` in a thread."""
         try:
             found = await run_in_threadpool(ask)
         except ConnectionFailedError as error:
@@ -335,7 +334,6 @@ def _route(path: str, **handlers: Handler) -> Route:
 
 
 def _answering(handler: Handler) -> Handler:
-    """Turn the errors of a handler into answers."""
 
     @wraps(handler)
     async def answer(request: Request) -> Response:

@@ -192,7 +192,6 @@ class _FollowedRun:
 
     @property
     def name(self) -> str:
-        """The run's name."""
         return self.status.run
 
     @property
@@ -207,7 +206,6 @@ class _FollowedRun:
 
     @property
     def full_status(self) -> Status:
-        """The status with every worker."""
         return replace(self.status, worker_list=tuple(self._workers))
 
     def matches(self, final_status: Status) -> bool:
@@ -219,7 +217,6 @@ class _FollowedRun:
         return status.incarnation != self.status.incarnation or len(self.history) > status.generations
 
     def update(self, status: Status, client: Client, now: float) -> None:
-        """Take a status, and fetch the rows that it leaves out."""
         self.status, self.heard, self.lost = status, now, None
         self._workers, self._population = status.worker_list, (status.population,)
         self.lanes.update(self._workers, now)
@@ -237,7 +234,6 @@ class _FollowedRun:
         self._append_recent(status)
 
     def events(self, live: list[str]) -> RunEvents:
-        """The events for viewers."""
         snapshot = RunSnapshot(
             self.status, self._workers, self.lanes.render(self._workers), self._population, self.heard, self.lost,
             folder=None if self._quartiles is None else self.runs_dir / self.name, word=self._word,
@@ -247,7 +243,6 @@ class _FollowedRun:
         return RunEvents(frame, self._rendered_curves[1], (self.uid, self.drawings))
 
     def _fetch_missing_rows(self, status: Status, client: Client) -> None:
-        """Fetch closed generations and evaluations that are not known yet."""
         self._append_recent(status)
         if len(self.history) < min(status.generations, MOST_ROWS):
             self._append(_fetch_rows(client, "history", StoredGeneration, self.name, len(self.history)))
@@ -274,7 +269,6 @@ class _FollowedRun:
         self.evaluations = sorted({each.generation: each for each in found}.values(), key=lambda each: each.generation)
 
     def _render_curves(self) -> None:
-        """Render the curves again if their data changed."""
         of = len(self.history), tuple(self.evaluations[-1:]), len(self.evaluations), self.status.confirmed
         if self._rendered_curves[0] == of:
             return

@@ -79,7 +79,6 @@ def _eta(eta: Eta) -> dict[str, Any]:
 
 
 def _tiles(view: LiveRunView, link: str) -> list[dict[str, str]]:
-    """The headline figures: name, value and caption."""
     status, last, reported, eta = view.status, view.last, view.reported, view.eta
     spent = format_steps(status.throughput.environment_steps)
     return [
@@ -109,7 +108,6 @@ def tile(name: str, value: str, caption: str) -> dict[str, str]:
 
 
 def _awaited_score(status: Status) -> str:
-    """When the first score comes."""
     every = status.settings.evaluate_every
     if not every:
         return "means are not evaluated"
@@ -178,7 +176,6 @@ def _redundant_work(view: LiveRunView) -> dict[str, Any]:
 
 
 def _problems(status: Status) -> list[str]:
-    """Problems that may need action."""
     found = [*filter(None, [status.equal_fitness]), *status.refusals]
     for failure in status.failures:
         for worker, error in failure.errors.items():

@@ -59,26 +59,19 @@ def format_markdown(run: RunFolder) -> str:
     """The same as Markdown: a list, the commands, and BibTeX entries of the run and the software."""
     controller = load_controller_of(run)
     receipt, settings = read_run_provenance(controller), read_run_settings(controller)
-    lines = [
-        f"# Run {run.name}",
-        "",
-        *(f"- {name}: {value}" for name, value in _rows(run, controller, receipt, settings)),
-    ]
+    rows = [f"- {name}: {value}" for name, value in _rows(run, controller, receipt, settings)]
     commands = [f"{command}   # {why}" for why, command in _commands(run).items()]
-    return "\n".join(
-        [*lines, "", "```sh", *commands, "```", "", "```bibtex", *_bibtex(run, controller, receipt), "```"]
-    )
+    entries = _bibtex(run, controller, receipt)
+    parts = [f"# Run {run.name}", "", *rows, "", "```sh", *commands, "```", "", "```bibtex", *entries, "```"]
+    return "\n".join(parts)
 
 
 def _rows(
     run: RunFolder, controller: Controller, receipt: RunProvenance, settings: RunSettings
 ) -> Iterator[tuple[str, str]]:
     spec, view = settings.task, view_of(run)
-    at = (
-        ""
-        if run.duration_seconds is None
-        else f" at {run.ended_at}, {format_duration(run.duration_seconds)} after it began"
-    )
+    lasted = run.duration_seconds
+    at = "" if lasted is None else f" at {run.ended_at}, {format_duration(lasted)} after it began"
     since, state = run.created or "at an unknown time", f"ended after {run.ended}{at}" if run.ended else "open"
     yield "run", f"`{run.uid}`, begun {since}, {state}"
     yield "controller", f"SHA-256 `{controller.sha256}` of its parameters"

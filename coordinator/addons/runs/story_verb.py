@@ -41,12 +41,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--what", nargs="+", metavar="WORD", default=(),
         help="only events of these kinds, such as: joined back silent lost left reissued",
     )  # fmt: skip
-    parser.add_argument(
-        "--last",
-        type=int,
-        metavar="N",
-        help=f"so many events at most (default {LAST} of a live run; all of a journal, or with --json)",
-    )
+    text = f"so many events at most (default {LAST} of a live run; all of a journal, or with --json)"
+    parser.add_argument("--last", type=int, metavar="N", help=text)
     add_global_flags(parser, "connect", "runs_dir")
     add_json_flag(parser)
 
@@ -103,9 +99,8 @@ def _print_journal(args: argparse.Namespace) -> int:
         events, failures = stored.events(), stored.failures()
     events = events[-(args.last or len(events) or 1) :]
     if args.json:
-        print(
-            json.dumps({"events": [asdict(each) for each in events], "failures": [asdict(each) for each in failures]})
-        )
+        found = {"events": events, "failures": failures}
+        print(json.dumps({name: [asdict(each) for each in rows] for name, rows in found.items()}))
         return 0
     print_rows([{"time (UTC)": _format_time(each.happened), "life": each.incarnation, "event": each.text}
                 for each in events], right=("life",))  # fmt: skip

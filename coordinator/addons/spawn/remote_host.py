@@ -217,7 +217,6 @@ class RemoteHost:
         return self._parcel(found).environment(found.python, found.machine)
 
     def _parcel(self, found: HostAnswer) -> Parcel:
-        """The parcel for the system and processor of a host."""
         return pack(self.host.spawn.wheelhouse, native=runs_here(found.system, found.machine))
 
     def _python(self, found: HostAnswer) -> str:

@@ -113,7 +113,6 @@ def allocate_lines(blocks: Sequence[Block], lines: int | None) -> list[int]:
 
 
 def _blocks(status: Status, width: int, worker_flags: str) -> Iterator[Block]:
-    """The blocks from top to bottom."""
     view = LiveRunView.of_status(status)
     yield _text_block(0, view.state, width, STATE_STYLES.get(status.state, ""), min_lines=2)
     for trouble, style in _troubles(status):
@@ -134,7 +133,6 @@ def _blocks(status: Status, width: int, worker_flags: str) -> Iterator[Block]:
 
 
 def _troubles(status: Status) -> Iterator[tuple[str, str]]:
-    """What needs somebody, with its style."""
     if status.failures and not status.why:
         yield _describe_failure(status.failures[0]), "red"
     if status.checks is not None and status.checks.waiting and not status.why:
@@ -146,7 +144,6 @@ def _troubles(status: Status) -> Iterator[tuple[str, str]]:
 
 
 def _progress_lines(view: LiveRunView, width: int) -> list[Text]:
-    """The run's one bar, in front of its one estimate."""
     share = view.eta.share
     bar = "" if share is None else f"{share_bar(share, min(BAR_WIDTH, width // 3))} {share:4.0%}  "
     lines = _wrap(printable(view.eta.description), max(width - len(bar), 1))
@@ -252,7 +249,6 @@ def _open_population(status: Status) -> Population | None:
 
 
 def _candidate_lines(status: Status, population: Population, width: int, lines: int) -> list[Text]:
-    """A caption and the grid of candidates."""
     found = [each for each in population.candidates if each.fitness is not None]
     done, wanted = status.generation.episodes_done, status.generation.episodes
     if population.generation != status.generation.number:

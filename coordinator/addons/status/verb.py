@@ -69,8 +69,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _can_redraw() -> bool:
     """Whether the terminal can redraw; a dumb one would show nothing until the end."""
-    console = Console()
-    return sys.stdout.isatty() and not console.is_dumb_terminal
+    return sys.stdout.isatty() and not Console().is_dumb_terminal
 
 
 def print_runs(documents: Sequence[dict[str, Any]]) -> None:
@@ -118,7 +117,6 @@ def _retry_until_answered(ask: Callable[[], T]) -> T:
 
 
 def _follow_documents(client: Client, name: str) -> Iterator[dict[str, Any]]:
-    """Status after status, until the coordinator leaves."""
     while True:
         try:
             yield from client.watch_documents(name, REFRESH)

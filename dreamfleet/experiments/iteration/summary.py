@@ -96,7 +96,6 @@ def _figure(gate: Mapping[str, Any] | None, name: str) -> str | None:
 
 
 def _survival(gate: Mapping[str, Any] | None) -> dict[str, object]:
-    """The column of survival, where that was measured."""
     return {SURVIVES: _figure(gate, SURVIVES)} if gate and SURVIVES in gate["new"] else {}
 
 

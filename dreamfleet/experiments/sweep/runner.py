@@ -235,7 +235,6 @@ class SweepRunner:
 
 
 def _describe(status: Mapping[str, Any]) -> str:
-    """How far a run is, in words."""
     with suppress(KeyError, TypeError, ValueError):  # a coordinator of another version
         closed, limit = int(status["generations"]), int(status["limits"].get("generations") or 0)
         state = "" if status["state"] == "running" else f"{status['state']}, "
