@@ -8,7 +8,7 @@ import re
 import sys
 from dataclasses import asdict
 from datetime import UTC, datetime
-from typing import get_args
+from typing import Any, get_args
 
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
 from dreamfleet.common.cli.output import add_json_flag, print_rows
@@ -99,7 +99,7 @@ def _print_journal(args: argparse.Namespace) -> int:
         events, failures = stored.events(), stored.failures()
     events = events[-(args.last or len(events) or 1) :]
     if args.json:
-        found = {"events": events, "failures": failures}
+        found: dict[str, list[Any]] = {"events": events, "failures": failures}
         print(json.dumps({name: [asdict(each) for each in rows] for name, rows in found.items()}))
         return 0
     print_rows([{"time (UTC)": _format_time(each.happened), "life": each.incarnation, "event": each.text}
