@@ -9,7 +9,6 @@ import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import asdict
-from functools import wraps
 from time import monotonic
 from typing import Any
 
@@ -63,7 +62,8 @@ def make_app(client: Client, changes: Changes, tokens: Sequence[str], *, is_loop
         _route("/v1/runs/{run}/batches", GET=handlers.list_batches, POST=handlers.submit),
         _route(batch, GET=handlers.read, DELETE=handlers.cancel), _route(f"{batch}/events", GET=handlers.events),
     ]  # fmt: skip
-    app = Starlette(routes=routes, exception_handlers={HTTPException: _http_error, Exception: _bug})
+    ours: dict[Any, Any] = {DreamfleetError: _refused, ClientDisconnect: _disconnected}
+    app = Starlette(routes=routes, exception_handlers={**ours, HTTPException: _http_error, Exception: _bug})
     return BridgeGuard(app, tokens, is_loopback=is_loopback)
 
 
@@ -330,26 +330,19 @@ def _route(path: str, **handlers: Handler) -> Route:
     async def handle(request: Request) -> Response:
         return await handlers["GET" if request.method == "HEAD" else request.method](request)
 
-    return Route(path, _answering(handle), methods=[*handlers])
+    return Route(path, handle, methods=[*handlers])
 
 
-def _answering(handler: Handler) -> Handler:
+async def _refused(_request: Request, error: Exception) -> Response:
+    if isinstance(error, BatchError):
+        headers = {"retry-after": "1"} if error.refusal == "busy" else {}
+        return _error(STATUS[error.refusal], error.refusal, str(error), headers)
+    status, kind = (400, "malformed") if isinstance(error, UsageError) else (502, "failed")
+    return _error(status, kind, str(error))
 
-    @wraps(handler)
-    async def answer(request: Request) -> Response:
-        try:
-            return await handler(request)
-        except BatchError as error:
-            headers = {"retry-after": "1"} if error.refusal == "busy" else {}
-            return _error(STATUS[error.refusal], error.refusal, str(error), headers)
-        except UsageError as error:
-            return _error(400, "malformed", str(error))
-        except DreamfleetError as error:
-            return _error(502, "failed", str(error))
-        except ClientDisconnect:
-            return Response(status_code=400)
 
-    return answer
+async def _disconnected(_request: Request, _error: Exception) -> Response:
+    return Response(status_code=400)
 
 
 async def _http_error(_request: Request, error: Exception) -> Response:

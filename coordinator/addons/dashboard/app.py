@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import aclosing
 from pathlib import Path
 from typing import Any
@@ -41,7 +41,8 @@ def make_app(feed: Feed, views: ViewProcesses, runs_dir: Path, config: Dashboard
         Route("/hosts/{name}", handlers.hosts), Route("/compare/{one}/{other}", handlers.compare),
     ]  # fmt: skip
     tokens = () if config.token is None else (config.token,)
-    return PageGuard(Starlette(routes=routes), tokens, is_loopback=config.is_loopback)
+    app = Starlette(routes=routes, exception_handlers={DreamfleetError: _not_found})  # of what a path names
+    return PageGuard(app, tokens, is_loopback=config.is_loopback)
 
 
 class _Handlers:
@@ -92,14 +93,13 @@ class _Handlers:
         return json_response({"runs": rows, "folder": printable(str(self._runs_dir))})
 
     def run(self, request: Request) -> Response:
-        return _found(stored_runs.describe_run, self._runs_dir, request.path_params["name"])
+        return json_response(stored_runs.describe_run(self._runs_dir, request.path_params["name"]))
 
     def hosts(self, request: Request) -> Response:
-        return _found(stored_runs.describe_hosts, self._runs_dir, request.path_params["name"])
+        return json_response(stored_runs.describe_hosts(self._runs_dir, request.path_params["name"]))
 
     def compare(self, request: Request) -> Response:
-        names = request.path_params["one"], request.path_params["other"]
-        return _found(compare_runs, self._runs_dir, *names)
+        return json_response(compare_runs(self._runs_dir, request.path_params["one"], request.path_params["other"]))
 
     async def _events(self, run: str | None) -> AsyncIterator[bytes]:
         """A frame for each snapshot, and the curves whenever they changed."""
@@ -121,9 +121,5 @@ def _stream(request: Request, events: AsyncIterator[bytes]) -> Response:
     return Response(media_type=EVENTS) if request.method == "HEAD" else StreamingResponse(events, media_type=EVENTS)
 
 
-def _found(read: Callable[..., dict[str, Any]], *given: Any) -> Response:
-    """What `read` finds in journals, or 404 with the reason."""
-    try:
-        return json_response(read(*given))
-    except DreamfleetError as error:
-        return json_response({"error": printable(str(error))}, 404)
+async def _not_found(_request: Request, error: Exception) -> Response:
+    return json_response({"error": printable(str(error))}, 404)

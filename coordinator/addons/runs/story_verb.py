@@ -38,7 +38,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     which.add_argument("--worker", metavar="W", help="of this worker, or of all lives of this host's worker")
     which.add_argument("--job", metavar="G/I", help="of this candidate's jobs: generation/index, such as 3/0")
     parser.add_argument(
-        "--what", nargs="+", metavar="WORD", default=(),
+        "--what", nargs="+", metavar="WORD", default=(), choices=get_args(EventKind),
         help="only events of these kinds, such as: joined back silent lost left reissued",
     )  # fmt: skip
     text = f"so many events at most (default {LAST} of a live run; all of a journal, or with --json)"
@@ -71,8 +71,6 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(f"--worker {args.worker!r}: give a name as `dreamfleet status` shows it")
     if args.last is not None and args.last < 1:
         raise UsageError("--last must be at least 1")
-    if strange := [each for each in args.what if each not in (words := get_args(EventKind))]:
-        raise UsageError(f"--what {strange[0]!r}: there are {', '.join(words)}")
 
 
 def _print_live(args: argparse.Namespace) -> int:
