@@ -13,6 +13,7 @@ import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
+from dreamfleet.coordinator.run.recall import bar_stored
 from dreamfleet.experiments.sweep import runner
 from tests.support import tasks
 from tests.support.processes import ROOT, call_here, until
@@ -106,6 +107,21 @@ def test_a_run_that_fails_stops_no_other(processes, small, monkeypatch):
     assert call_here("sweep", "--run", "both", *vary, *flags)[0] == 1
     with open_run(processes.runs, f"both-task-{tasks.SLOW_TOY.lower().replace('.', '-').replace(':', '-')}") as run:
         assert run.ended == "2 generations"
+
+
+@pytest.mark.slow
+def test_a_run_from_which_its_own_workers_are_barred_fails_and_says_how_to_let_them_in(processes, sweep, monkeypatch):
+    monkeypatch.setattr(runner, "PAUSE_PATIENCE", 1.0)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    assert sweep("--vary", "seed=1..2", "--generations", 1).finish()[0] == 0
+    folder, words = processes.runs / "toys-seed2", ("--resume", "toys", "--workers", 2, "--runs-dir", processes.runs)
+    for host in ("core-0", "core-1"):
+        bar_stored(folder, host, is_barred=True)
+    code, _, text = call_here("sweep", *words)
+    assert code == 1
+    assert f"bar core-0 toys-seed2 --no-longer --runs-dir {processes.runs}" in text
+    bar_stored(folder, "core-1", is_barred=False)
+    assert call_here("sweep", *words)[0] == 0
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes everywhere")

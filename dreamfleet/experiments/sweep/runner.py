@@ -15,12 +15,13 @@ from typing import Any
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import DreamfleetError, StoppedError
 from dreamfleet.common.host.child import END_TIMEOUT
-from dreamfleet.common.host.processes import VerbProcess
+from dreamfleet.common.host.processes import VerbProcess, shell_command
 from dreamfleet.common.host.stop_signals import Stop, signals_deferred
 from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.addons.environment_check import CHECKED
+from dreamfleet.coordinator.run.shown_state import WAITS_FOR_WORKERS
 from dreamfleet.experiments.local import local_run
 from dreamfleet.experiments.local.command_lines import Words, command
 from dreamfleet.experiments.local.local_run import POLL_INTERVAL, has_begun, has_ended, task_flags
@@ -66,7 +67,7 @@ class RunProgress:
     state: str = "waiting"  # running, finished, failed, left open
     text: str = ""
     restarts: int = 0
-    paused_since: float | None = None  # while it is paused, and not by hand
+    paused_since: float | None = None  # while it is paused, and not by hand, or only barred workers are here
 
     @property
     def is_over(self) -> bool:
@@ -178,14 +179,26 @@ class SweepRunner:
             status = found.get(self._uid_of(each.run.name))
             if status is None or each.run.name not in self._coordinators:
                 continue
-            each.text = _describe(status)
-            if status.get("state") != "paused" or status.get("pauses") == [PauseKind.BY_HAND]:
+            barred = self._describe_barred(each.run.name, status)
+            each.text = barred or _describe(status)
+            if not barred and (status.get("state") != "paused" or status.get("pauses") == [PauseKind.BY_HAND]):
                 each.paused_since = None
             elif each.paused_since is None:
                 each.paused_since = self._looked_at
             elif self._looked_at - each.paused_since > PAUSE_PATIENCE:
-                each.state, each.text = "failed", f"paused: {status.get('why')}"
+                each.state, each.text = "failed", barred or f"paused: {status.get('why')}"
                 self._coordinators[each.run.name].ask_to_end()
+
+    def _describe_barred(self, name: str, status: Mapping[str, Any]) -> str:
+        """That a run waits, since all of this host's workers are barred from it, and what to do; empty: it does not."""
+        checks = status.get("checks") or {}
+        workers = {each for each in self._helpers if each != "router"}
+        if status.get("state") != WAITS_FOR_WORKERS or not workers or not workers <= {*checks.get("barred", ())}:
+            return ""
+        again = shell_command("bar", min(workers), name, "--no-longer", "--runs-dir", self._folder.runs_dir)
+        return (
+            f"it waits for workers, and this host's are barred from it; one that scores rightly may join again: {again}"
+        )
 
     def _uid_of(self, name: str) -> str | None:
         """A run's own name for ever; `None` before it has begun."""
