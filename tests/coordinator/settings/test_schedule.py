@@ -120,6 +120,13 @@ def test_what_this_run_cannot_do_is_one_line(read, settings, text, names):
         settings(text)
 
 
+def test_what_this_run_cannot_do_with_its_flags_names_the_stage(settings):
+    with pytest.raises(UsageError, match=r"1 .*--evaluate-every"):
+        settings("[[stage]]\nscore = 1.0\n" + NEXT, evaluate_every=0)
+    with pytest.raises(UsageError, match=r"2.*--driven .*0\.1 .*4"):
+        settings("[[stage]]\ngenerations = 3\n[[stage]]\ndriven = 0.1\nepisodes = 4\n", task="dream")
+
+
 def args(file=None, given=()):
     return argparse.Namespace(sources={"file": file or {}}, given=frozenset(given))
 
@@ -189,18 +196,3 @@ def test_a_share_that_is_driven_stays_a_share_whatever_the_episodes(settings):
 def test_what_cannot_be_driven_is_said(flags, names):
     with pytest.raises(UsageError, match=names):
         RunConfig(**flags)
-
-
-@pytest.mark.parametrize(
-    ("text", "flags", "names"),
-    [
-        ("[[stage]]\nscore = 1.0\n" + NEXT, {"evaluate_every": 0}, "1 .*--evaluate-every"),
-        (
-            "[[stage]]\ngenerations = 3\n[[stage]]\ndriven = 0.1\nepisodes = 4\n",
-            {"task": "dream"}, r"2.*--driven .*0\.1 .*4",
-        ),
-    ],
-)  # fmt: skip
-def test_what_this_run_cannot_do_with_its_flags_names_the_stage(settings, text, flags, names):
-    with pytest.raises(UsageError, match=names):
-        settings(text, **flags)

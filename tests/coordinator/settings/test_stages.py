@@ -80,15 +80,6 @@ def undisturbed(staged):
     return bench.outcome()
 
 
-@pytest.mark.parametrize("optimiser", ["cma", "tests.support.optimisers:ParentsAndChildren"])
-def test_killed_as_each_generation_opens_every_optimiser_gives_the_same_bits(staged, optimiser):
-    settings = replace(STAGED, optimiser=optimiser)
-    calm, killed = staged(settings=settings), staged(settings=settings)
-    calm.end()
-    drive_with_kills(killed)
-    assert killed.outcome() == calm.outcome()
-
-
 def drive_with_kills(bench):
     """To its end, while its coordinator is killed as each generation opens."""
     while bench.run.state.ended is None:

@@ -1,4 +1,4 @@
-"""What each phase asks of the stages, and its coordinator's flags."""
+"""What each phase asks of the stages, and its flags. Tests dreamfleet/experiments/local/command_lines.py."""
 
 from pathlib import Path
 
@@ -102,7 +102,9 @@ def test_a_round_evolves_in_the_model_that_counts_with_flags_of_its_own():
     assert run.flags_of_run(1) == ("--generations", "3", "--temperature", "1")
 
 
-@pytest.mark.parametrize("flags", ["--data elsewhere", "--updates 3 --seed=9", "--continue other.safetensors", "--new"])
+@pytest.mark.parametrize(
+    "flags", ["--data elsewhere", "--updates 3 --seed=9", "--see=3", "--x --seed", "--continue other", "--new"]
+)
 def test_flags_that_the_iteration_sets_itself_are_refused(flags):
     with pytest.raises(UsageError, match="--vae-flags"):
         IterateConfig(vae_flags=flags)
