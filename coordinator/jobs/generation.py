@@ -66,7 +66,7 @@ class Generation:
         self._steps = np.zeros(self._scores.shape, dtype=np.int64)  # a result's steps stand in each of its places
         self._measures = np.full((*self._scores.shape, len(spec.measures)), np.nan)
         self._lost = np.zeros(self._scores.shape, dtype=bool)  # places whose episode failed for good
-        self._failed = np.zeros(len(vectors), dtype=bool)  # candidates
+        self._failed = np.zeros(len(vectors), dtype=bool)  # candidates, cancelled ones too
         if in_parts and distinct == len(vectors):
             self.make_more()
         else:
@@ -125,7 +125,12 @@ class Generation:
     @property
     def failed(self) -> list[int]:
         """The candidates that failed."""
-        return [int(each) for each in np.flatnonzero(self._failed)]
+        return np.flatnonzero((self._lost & self._wanted).any(axis=1)).tolist()
+
+    @property
+    def without_fitness(self) -> list[int]:
+        """The candidates that failed, and those that were cancelled."""
+        return np.flatnonzero(self._failed).tolist()
 
     @property
     def has_failures(self) -> bool:
@@ -205,7 +210,7 @@ class Generation:
         return self._open_second_half()
 
     def cancel(self) -> None:
-        """Want no more results: candidates that lack an episode count as failed."""
+        """Want no more results: candidates that lack an episode get no fitness."""
         self._failed |= self._open_places.any(axis=1)
 
     def recall(self, results: Mapping[bytes, KnownResult]) -> None:

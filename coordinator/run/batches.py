@@ -234,7 +234,7 @@ class Batches:
         page = slice(offset, offset + limit)
         columns = zip(scores.fitness[page], is_done[page], strict=True)
         fitness = [value if done else None for value, done in columns]
-        failed = [each for each in generation.failed if offset <= each < offset + limit]
+        failed = [each for each in generation.without_fitness if offset <= each < offset + limit]
         for each in failed:
             fitness[each - offset] = None
         return fitness, generations.find_errors(generation, failed) if failed else {}, sum(is_done)

@@ -75,13 +75,13 @@ class ExternalGenerations(Generations):
         )  # fmt: skip
         self._journal.close_generation(closed, fitness)
         if batch is not None:
-            self._journal.batches.finish(batch.id, self.find_errors(generation, generation.failed))
+            self._journal.batches.finish(batch.id, self.find_errors(generation, generation.without_fitness))
         self.history.append(closed)
         self.last, self._scored_before = generation.candidate_scores(), generation.find_scored() or self._scored_before
         return closed
 
     def find_errors(self, generation: Generation, candidates: list[int]) -> dict[int, str]:
-        """Why each of these failed candidates of the open generation failed."""
+        """Why each of these candidates of the open generation has no fitness."""
         wanted = set(candidates)
         digests = [each.digest for each in generation.work if each.template.candidate in wanted]
         found = self._journal.results.errors_of(digests)

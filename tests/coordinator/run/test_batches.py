@@ -16,6 +16,7 @@ from dreamfleet.coordinator.run.recall import recall
 from dreamfleet.coordinator.run.shown_state import shown_state
 from dreamfleet.coordinator.storage.verification_records import StoredBar
 from tests.support.batch_door import SETTINGS, SIZE, Door, vectors
+from tests.support.snapshots import snapshot_of
 
 
 @pytest.fixture
@@ -169,6 +170,7 @@ def test_a_cancelled_batch_keeps_its_scores(door, is_killed):
     door.work(2)
     assert door.query("cancel", id="b").state == "cancelled"
     assert door.query("cancel", id="a").state == "cancelled"
+    assert snapshot_of(door).status.generation.failed == 0
     if is_killed:
         door.run.commit()
         door.restart()
@@ -176,7 +178,7 @@ def test_a_cancelled_batch_keeps_its_scores(door, is_killed):
     reply = door.query("read", id="a")
     assert (reply.done, reply.fitness[1:]) == (3, (None, None))
     assert [(each.candidate, each.error) for each in reply.errors] == [(1, "cancelled"), (2, "cancelled")]
-    assert door.run.generation.number == 1
+    assert (door.run.generation.number, door.run.history.last.failed) == (1, 0)
     door.work()
     assert door.query("cancel", id="c").state == "complete"
     assert door.submit("b").state == "cancelled"
