@@ -3,8 +3,8 @@
 import pytest
 
 from dreamfleet.experiments.iteration.gate import KNOWS, LOSES, SURVIVES, Figure, figures, judge
+from dreamfleet.worker.addons.inspection.dream_comparisons import LossReport, RoadLossComparison
 from dreamfleet.worker.addons.inspection.probe import Estimate, Knowledge, KnownQuantity
-from dreamfleet.worker.addons.inspection.road_losses import LossReport, RoadLossComparison
 from dreamfleet.worker.addons.inspection.survival import Survival
 
 

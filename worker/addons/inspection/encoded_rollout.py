@@ -15,11 +15,11 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.foreign_code import answer_kept
 from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.seeds import VALIDATION
-from dreamfleet.worker.addons.inspection.drivers import check_same_pictures
+from dreamfleet.worker.addons.inspection.subject import check_same_pictures
 from dreamfleet.worker.scoring.disturbance import numbered_choices
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.api import Assignment, Continuous, Policy, World
-from dreamfleet.worker.tasks.closing import close_environment
+from dreamfleet.worker.tasks.closing import closing_environment
 from dreamfleet.worker.tasks.policy import DriverPolicy
 from dreamfleet.worker.tasks.recordable import RecordableTask
 from dreamfleet.worker.tasks.registry import task_of
@@ -57,8 +57,7 @@ class EncodedRollout:
     @property
     def nats(self) -> Floats:
         """The information in each latent `(latent,)`: its mean KL divergence from the standard normal, in nats."""
-        nats: Floats = self._divergence.mean(axis=0)
-        return nats
+        return np.asarray(self._divergence.mean(axis=0))
 
     @property
     def most_active(self) -> NDArray[np.int64]:
@@ -74,8 +73,7 @@ class EncodedRollout:
     @property
     def _divergence(self) -> Floats:
         """The KL divergence of each latent at each step, in nats `(T, latent)`."""
-        divergence: Floats = 0.5 * (self.mu**2 + np.exp(self.logvar) - self.logvar - 1)
-        return divergence
+        return np.asarray(0.5 * (self.mu**2 + np.exp(self.logvar) - self.logvar - 1))
 
 
 class ConstantDriver:
@@ -90,17 +88,12 @@ class ConstantDriver:
             action = _choice_of(action, actions, names).tolist()
         done = np.array(action, np.float64)
         if not isinstance(actions, Continuous) or done.shape != (actions.actions,):
-            wanted = (
-                f"{', '.join(names)}: {plural(len(names), 'number')}"
-                if names
-                else "numbers, of a world with such actions"
-            )
+            numbers = f"{', '.join(names)}: {plural(len(names), 'number')}"
+            wanted = numbers if names else "numbers, of a world with such actions"
             raise UsageError(f"--action takes {wanted}, not {_format_action(action)}")
         if not ((actions.low <= done) & (done <= actions.high)).all():
-            bounds = ", ".join(
-                f"{name} from {low:g} to {high:g}"
-                for name, low, high in zip(names or count(1), actions.low, actions.high, strict=False)
-            )
+            ends = zip(names or count(1), actions.low, actions.high, strict=False)
+            bounds = ", ".join(f"{name} from {low:g} to {high:g}" for name, low, high in ends)
             raise UsageError(f"--action takes {bounds}, not {_format_action(action)}")
         self._done = done.astype(np.float32)
 
@@ -137,10 +130,8 @@ def record_drive(
     task, driver = task_of(bundle), "the controller"
     policy: Policy = task.make_policy(assignment)
     if config.action:
-        driver, policy = (
-            f"one action alone, {_format_action(config.action)}",
-            DriverPolicy(ConstantDriver(config.action, task.world_of(assignment))),
-        )
+        driver = f"one action alone, {_format_action(config.action)}"
+        policy = DriverPolicy(ConstantDriver(config.action, task.world_of(assignment)))
     elif controller is not None:
         policy.begin(controller.parameters)
     elif isinstance(task, RecordableTask):
@@ -148,12 +139,8 @@ def record_drive(
         policy = DriverPolicy(list(task.drivers.values())[1 % len(task.drivers)](np.random.default_rng(config.seed)))
     else:
         raise UsageError(f"task {bundle.manifest.task} has no driver: look at a run, whose controller drives")
-    environment = task.make_environment(assignment)
-    try:
-        with answer_kept():  # the page is written behind it
-            moments = list(run_episode(environment, policy, EpisodeConfig(config.seed, config.steps)))
-    finally:
-        close_environment(environment)
+    with closing_environment(task.make_environment(assignment)) as environment, answer_kept():  # the page follows
+        moments = list(run_episode(environment, policy, EpisodeConfig(config.seed, config.steps)))
     seen = np.stack([moment.seen for moment in moments])
     mu, logvar = Encoder(bundle).encode(seen)
     actions, rewards = np.stack([moment.action for moment in moments]), np.array([each.reward for each in moments])

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.worker.addons.inspection.charts import FONT, draw_heatmap, new_figure, picture_grid, render_png
 from dreamfleet.worker.addons.inspection.encoded_rollout import EncodedRollout
-from dreamfleet.worker.addons.inspection.page import Section
-from dreamfleet.worker.addons.inspection.vae_view import VAEView
+from dreamfleet.worker.addons.inspection.page import FONT, Section, draw_heatmap, new_figure, picture_grid, render_png
+from dreamfleet.worker.addons.inspection.vae_sections import VAEView
 from dreamfleet.worker.dream.noise import Draw, EpisodeNoise
 from dreamfleet.worker.dream.world import DreamWorld, check_temperature
 from dreamfleet.worker.worldmodel.inference import DreamStep, RewardLabel

@@ -14,9 +14,8 @@ from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.runs.seeds import VALIDATION
 
 if TYPE_CHECKING:
-    from dreamfleet.worker.addons.inspection.likeness import LikenessReport
+    from dreamfleet.worker.addons.inspection.dream_comparisons import LikenessReport, LossReport
     from dreamfleet.worker.addons.inspection.probe import Knowledge
-    from dreamfleet.worker.addons.inspection.road_losses import LossReport
     from dreamfleet.worker.addons.inspection.survival import Survival
 
 FigureReport: TypeAlias = "Survival | Knowledge | LikenessReport | LossReport"
@@ -76,7 +75,7 @@ class MeasureReport:
     def facts(self) -> dict[str, Any]:
         """All as values by name, as `inspect --json` prints them."""
         plain = asdict(self)
-        return {**{name: value for name, value in plain.items() if name != "found"}, **plain["found"]}
+        return plain | plain.pop("found")
 
 
 def measure(

@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.artifacts.bundle_store import find_bundle, shipped_names
-from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.world_facts import DRAWN, EndRule
-from dreamfleet.common.errors import BundleError, JournalError, MissingExtraError, UsageError
+from dreamfleet.common.errors import MissingExtraError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write, reporting_unwritable_folder
-from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.printable import plural
-from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.stages import begun_stages, join_distinct
-from dreamfleet.worker.addons.inspection import curve_sections, mdnrnn_sections, vae_sections
+from dreamfleet.common.runs.standard_error import format_with_error
+from dreamfleet.worker.addons.inspection import mdnrnn_sections, training_curves, vae_sections
 from dreamfleet.worker.addons.inspection.encoded_rollout import DriveConfig, EncodedRollout, record_drive
 from dreamfleet.worker.addons.inspection.page import Page, Section
-from dreamfleet.worker.addons.inspection.tables import measured_rows
+from dreamfleet.worker.addons.inspection.subject import InspectionSubject
 from dreamfleet.worker.addons.inspection.training_curves import MODELS, TrainingCurves, load_trainings
-from dreamfleet.worker.addons.inspection.vae_sections import own_pictures
-from dreamfleet.worker.addons.inspection.vae_view import CHECKPOINT, VAEView, held_out_drive
+from dreamfleet.worker.addons.inspection.vae_sections import CHECKPOINT, VAEView, held_out_drive, own_pictures
 from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.training.data.dataset import find_world, world_of_folder
@@ -39,42 +36,6 @@ UNITS = {  # units of the quality figures, by a part of their names, and which v
     "calibration": "mean probability of the end over the share of steps that ended: 1 is right",
 }
 DRIVEN = ("episodes", "frames", "held_out_episodes")  # counts in a bundle's provenance
-
-
-@dataclass(frozen=True)
-class InspectionSubject:
-    """What the page is about: a bundle, perhaps with a run and its controller, or a run without a world model.
-
-    With none of them the page shows trainings alone. `own` is the controller's world model if it is another.
-    """
-
-    bundle: Bundle | None
-    controller: Controller | None = None
-    run: RunFolder | None = None
-    own: Bundle | None = None
-
-
-@contextmanager
-def find_subject(name: str | None, runs_dir: Path) -> Iterator[InspectionSubject]:
-    """Find a bundle by its file or shipped name, else a run by its name, which stays open; without a name nothing."""
-    if not name:
-        yield InspectionSubject(None)
-        return
-    if is_file(Path(name)) or name in shipped_names():
-        yield InspectionSubject(find_bundle(name))
-        return
-    try:
-        run = open_run(runs_dir, name)
-    except JournalError as error:
-        shipped = ", ".join(shipped_names()) or "none"
-        raise BundleError(f"no bundle {name!r} (a file, or one that ships: {shipped}), and {error}") from error
-    with run:
-        bundle = Bundle.open(run.bundle_path, run.spec.bundle) if run.spec.bundle else None
-        controller: Controller | None = None
-        if bundle is not None and run.controller_path.exists():
-            controller = Controller.load(run.controller_path)
-            bundle = bundle.for_controller(controller)
-        yield InspectionSubject(bundle, controller, run)
 
 
 def write_page(
@@ -110,17 +71,11 @@ def _page(subject: InspectionSubject, trained: Sequence[TrainingCurves], section
         names = ", ".join(dict.fromkeys(each.name for each in trained))
         return Page(f"How {names} learnt", f"trainings: {len(facts)}", facts, sections)
     settings, history = subject.run.settings, subject.run.history()
-    stages = begun_stages(settings, history, subject.run.evaluations())
+    stages = [each.stage.settings for each in begun_stages(settings, history, subject.run.evaluations())]
     rows = [
         ("task", settings.task.task),
         ("controller", f"{plural(settings.controller.size, 'parameter')}, layers {settings.controller.layers}"),
-        (
-            "population",
-            join_distinct(
-                f"{each.stage.settings.population} x {plural(each.stage.settings.episodes, 'episode')}"
-                for each in stages
-            ),
-        ),
+        ("population", join_distinct(f"{each.population} x {plural(each.episodes, 'episode')}" for each in stages)),
         ("generations", str(len(history))),
     ]
     return Page(f"{subject.run.name}, a run without a world model", f"run {subject.run.uid}", rows + facts, sections)
@@ -140,9 +95,9 @@ def sections_of(
         yield from _bundle_sections(subject.bundle, subject, config)
     else:
         yield from _vae_sections(data, config)
-    if subject.run is not None and (evolved := curve_sections.fitness_section(subject.run)):
+    if subject.run is not None and (evolved := training_curves.fitness_section(subject.run)):
         yield evolved
-    yield from curve_sections.loss_sections(trained)
+    yield from training_curves.loss_sections(trained)
 
 
 def _find_vae_view(subject: InspectionSubject, data: Sequence[Path]) -> VAEView:
@@ -154,7 +109,6 @@ def _find_vae_view(subject: InspectionSubject, data: Sequence[Path]) -> VAEView:
 
 
 def _preprocessings(subject: InspectionSubject, data: Sequence[Path]) -> Collection[Preprocessing]:
-    """Those of the world of the subject, or of its data."""
     task = find_world(*world_of_folder(data[0])) if subject.bundle is None else task_of(subject.bundle)
     return tuple(getattr(task, "preprocessings", {}).values())
 
@@ -226,5 +180,22 @@ def manifest_facts(bundle: Bundle) -> list[tuple[str, str]]:
         unit = next((f" ({unit})" for known, unit in UNITS.items() if known in name), "")
         rows.append((f"quality: {name}", f"{value}{unit}"))
     measured = provenance.get("measured", [])
-    rows += [row for each in measured for row in measured_rows(each)] if isinstance(measured, list) else []
+    rows += [row for each in measured for row in _measured_rows(each)] if isinstance(measured, list) else []
     return [(name.replace("_", " "), value) for name, value in rows]
+
+
+def _measured_rows(measured: Any) -> Iterator[tuple[str, str]]:
+    """Yield a row for each main figure in a manifest's `measured`; malformed entries are left out."""
+    with suppress(KeyError, TypeError, ValueError, AttributeError, OverflowError):
+        for each in measured.get("probe", {}).get("known", ()):
+            yield f"R² of {each['quantity']}, linear on [z, h]", _estimate(each["found"]["zh_linear"])
+        for each in measured.get("losses", {}).get("begun", ()):
+            yield f"road lost in dreams begun {each['begun']}", _estimate(each["figures"]["lost"]["dream"])
+        for each in measured.get("survival", {}).get("policies", ()):
+            yield f"lives in dreams, of its real life: {each['policy']}", _estimate(each["ratio"])
+        for each in measured.get("likeness", {}).get("quantities", ()):
+            yield f"dreamt share of {each['quantity']} above {each['rare']:.3g}", _estimate(each["found"]["dream"])
+
+
+def _estimate(figure: dict[str, Any]) -> str:
+    return format_with_error(figure["value"], figure["error"], 2)

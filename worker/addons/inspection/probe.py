@@ -5,7 +5,7 @@ They are linear or by a small network, in NumPy alone: inspection needs no torch
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
 from dreamfleet.worker.addons.inspection.disturbed_rollouts import OFF, DisturbedDrive
 
 Floats = NDArray[np.float64]
+Table = tuple[Sequence[Mapping[str, object]], str]  # rows, and what describes them
 STRENGTH = 1e-3  # of the ridge penalty, per sample, on features of variance 1
 UNITS, UPDATES, BATCH, RATE, DECAY = 64, 2000, 256, 2e-3, 1e-2  # of the network
 MOMENTS, SMALL = (0.9, 0.999), 1e-8  # Adam's (Kingma & Ba 2015)
@@ -45,13 +47,11 @@ class Scale:
 
     def apply(self, values: Any) -> Floats:
         """Standardise values."""
-        scaled: Floats = (values - self.mean) / self.deviation
-        return scaled
+        return np.asarray((values - self.mean) / self.deviation)
 
     def undo(self, values: Any) -> Floats:
         """Map standardised values back."""
-        plain: Floats = values * self.deviation + self.mean
-        return plain
+        return np.asarray(values * self.deviation + self.mean)
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,6 @@ def _gradients(layers: Sequence[Any], x: Any, y: Any) -> tuple[Any, ...]:
 def _adam_step(
     layers: Sequence[Any], moments: Sequence[Any], gradients: Sequence[Any], rate: float, update: int
 ) -> None:
-    """Make one step of Adam in place."""
     for layer, (mean, square), gradient in zip(layers, moments, gradients, strict=True):
         mean[...] += (1 - MOMENTS[0]) * (gradient - mean)
         square[...] += (1 - MOMENTS[1]) * (gradient**2 - square)
@@ -134,15 +133,12 @@ def _adam_step(
         layer[...] -= rate * mean / (1 - MOMENTS[0] ** update) / size
 
 
-def folds(drives: int, most: int = 4) -> list[list[int]]:
-    """Split the drives' rows into cross-validation folds: a probe applied to one is fitted on the others."""
+def folds(drives: int, most: int = 4) -> Iterator[tuple[list[int], list[int]]]:
+    """Yield the drives' rows in each cross-validation fold, and all other rows, on which its probe is fitted."""
     parts = min(most, drives)
-    return [list(range(part, drives, parts)) for part in range(parts)]
-
-
-def other_rows(fold: Sequence[int], drives: int) -> list[int]:
-    """The rows that are not in a fold."""
-    return sorted(set(range(drives)) - set(fold))
+    for part in range(parts):
+        fold = range(part, drives, parts)
+        yield list(fold), [row for row in range(drives) if row not in fold]
 
 
 @dataclass(frozen=True)
@@ -163,6 +159,8 @@ class Estimate:
 
 Fit = Callable[[Floats, Floats], Probe]
 PROBES: tuple[tuple[str, Fit], ...] = (("linear", LinearProbe.fit), ("network", NetworkProbe.fit))
+HELD = {"z": "z", "zh": "[z, h]"}
+COLUMNS = {f"{inputs}_{kind}": f"{text}, {kind}" for inputs, text in HELD.items() for kind, _ in PROBES}
 
 
 @dataclass(frozen=True)
@@ -181,6 +179,18 @@ class Knowledge:
     drives: int
     steps: int
     known: tuple[KnownQuantity, ...]
+
+    def table(self) -> Table:
+        """As rows, and a text that describes them."""
+        rows = [
+            {"quantity": each.quantity, "deviation": f"{each.deviation:.3g}"}
+            | {COLUMNS[name]: str(share) for name, share in each.found.items()}
+            for each in self.known
+        ]
+        return rows, (
+            f"R² ± standard error on held-out drives; {plural(self.drives, 'drive')}, {plural(self.steps, 'step')}, "
+            "none off a road; deviations in the units of the world's true state (docs/reference/tasks.md)"
+        )
 
 
 def cross_validate_probes(drives: Sequence[DisturbedDrive], opening: int) -> Knowledge:
@@ -228,8 +238,7 @@ def _explained_share(wrong: Floats, spread: Floats) -> Floats:
 def _predict_held_out(features: Sequence[Floats], truths: Sequence[Floats], fit: Fit) -> list[Floats]:
     """Predict each drive's quantities by a map that was fitted without its fold."""
     predicted: dict[int, Floats] = {}
-    for fold in folds(len(features)):
-        rest = other_rows(fold, len(features))
+    for fold, rest in folds(len(features)):
         probe = fit(np.concatenate([features[row] for row in rest]), np.concatenate([truths[row] for row in rest]))
         predicted |= {row: probe.predict(features[row]) for row in fold}
     return [predicted[row] for row in range(len(features))]

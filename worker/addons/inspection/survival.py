@@ -18,7 +18,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.addons.inspection.encoded_rollout import ConstantDriver
-from dreamfleet.worker.addons.inspection.probe import Estimate
+from dreamfleet.worker.addons.inspection.probe import Estimate, Table
 from dreamfleet.worker.addons.recording.canvas import choice_name
 from dreamfleet.worker.dream.batch import MAX_ROWS
 from dreamfleet.worker.dream.noise import SharedNoise
@@ -26,7 +26,7 @@ from dreamfleet.worker.dream.world import DreamEnds, DreamWorld
 from dreamfleet.worker.scoring.disturbance import numbered_choices
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.api import Assignment, Driver, Task, World
-from dreamfleet.worker.tasks.closing import close_environment
+from dreamfleet.worker.tasks.closing import closing_environment
 from dreamfleet.worker.tasks.policy import NO_PARAMETERS, DriverPolicy
 from dreamfleet.worker.tasks.registry import task_of
 
@@ -105,6 +105,25 @@ class Survival:
         error = math.hypot(*known) / len(policies) if len(known) == len(errors) else None
         return cls(config.episodes, config.temperature, limit, end, policies, Estimate(value, error))
 
+    def table(self) -> Table:
+        """As rows, and a text that describes them."""
+        rows = [
+            {
+                "policy": each.policy,
+                "reality": str(each.real),
+                "dream": str(each.dreamt),
+                "dream / reality": str(each.ratio),
+                "cut, reality": f"{each.real_cut:.0%}",
+                "cut, dream": f"{each.dreamt_cut:.0%}",
+            }
+            for each in self.policies
+        ]
+        return rows, (
+            f"mean steps ± standard error of {self.episodes} real and {self.episodes} dreamt episodes each, cut at "
+            f"{self.limit}; temperature {self.temperature:g}, end {self.end}; agreement {self.agreement} (0: equally "
+            "long everywhere, -0.69: twice or half as long)"
+        )
+
 
 def measure_survival(
     bundle: Bundle, controller: Controller | None, config: SurvivalConfig,
@@ -171,8 +190,8 @@ def _real_lengths(
     That limit falls to the simulator's where this ends an episode by one.
     """
     limit, lengths = min(task.world_of(assignment).horizon, LONGEST), list[int]()
-    policy, environment = task.make_policy(assignment), task.make_environment(assignment)
-    try:
+    policy = task.make_policy(assignment)
+    with closing_environment(task.make_environment(assignment)) as environment:
         for make in drivers.values():
             for seed in seeds:
                 actor = policy if make is None else DriverPolicy(make(np.random.default_rng(seed)))
@@ -182,8 +201,6 @@ def _real_lengths(
                 on_episode(len(lengths))
                 if last.ended and not last.terminal:
                     limit = last.step
-    finally:
-        close_environment(environment)
     return list(np.array(lengths).reshape(len(drivers), len(seeds))), limit
 
 

@@ -26,11 +26,12 @@ from dreamfleet.worker.addons.inspection.measure import (
 )
 
 if TYPE_CHECKING:
-    from dreamfleet.worker.addons.inspection.page_builder import InspectionSubject
+    from dreamfleet.worker.addons.inspection.subject import InspectionSubject
 
 SUMMARY = "look into a world model: what it sees, keeps and dreams, and how it learnt, as one page, or as figures"
 EXTRAS = ("worker", "views")
 FIRST = "--out --data --picture --controller --seed --steps --probe --losses --likeness --survival --episodes --json"
+WORDS = ("quantity", "begun", "mean", "policy")  # columns of the figures that are no numbers
 SECTIONS = 12  # at most, and one more a data folder
 
 
@@ -113,7 +114,8 @@ def _draw_page(args: argparse.Namespace) -> int:
         raise UsageError("only one can drive: give --controller or --action")
     from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.worker.addons.inspection.encoded_rollout import DriveConfig
-    from dreamfleet.worker.addons.inspection.page_builder import find_subject, write_page
+    from dreamfleet.worker.addons.inspection.page_builder import write_page
+    from dreamfleet.worker.addons.inspection.subject import find_subject
 
     with find_subject(args.subject, args.runs_dir) as found:
         subject = _with_driver(args, found)
@@ -135,10 +137,8 @@ def _measure(args: argparse.Namespace, figures: tuple[FigureName, ...]) -> int:
     )  # fmt: skip
 
     def show(_name: FigureName, found: FigureReport) -> None:
-        from dreamfleet.worker.addons.inspection.tables import table_of
-
-        rows, right, text = table_of(found)
-        print_rows(rows, right=right)
+        rows, text = found.table()
+        print_rows(rows, right=tuple(name for name in rows[0] if name not in WORDS))
         print(text)
 
     if args.json:
@@ -152,12 +152,12 @@ def _with_driver(args: argparse.Namespace, subject: InspectionSubject) -> Inspec
     """The subject, with the driver of its page if one is given."""
     if not args.controller:
         return subject
-    from dreamfleet.worker.addons.inspection.measurements import choose_driver
+    from dreamfleet.worker.addons.inspection.subject import choose_driver
 
     bundle, driving = choose_driver(subject, args.controller, args.runs_dir)
     controller, own = driving.controller, driving.own
-    if controller is None or own is None:
-        raise UsageError(f"controller {args.controller} sees no world model: give one that was evolved with one")
+    assert controller is not None  # it was named
+    assert own is not None
     if controller.bundle == bundle.sha256:
         return replace(subject, bundle=bundle.for_controller(controller), controller=controller)
     return replace(subject, bundle=bundle, controller=controller, own=own.for_controller(controller))

@@ -1,4 +1,4 @@
-"""Disturbed drives with the true state beside the world model's. Tests drivers.py."""
+"""Disturbed drives with the true state beside the world model's. Tests subject.py."""
 
 from dataclasses import replace
 from functools import partial
@@ -15,7 +15,7 @@ from dreamfleet.worker.addons.inspection.disturbed_rollouts import (
     first_sustained,
     record_disturbed_drives,
 )
-from dreamfleet.worker.addons.inspection.drivers import make_controller_actor, make_driver_actors
+from dreamfleet.worker.addons.inspection.subject import make_controller_actor, make_driver_actors
 from dreamfleet.worker.scoring.actors import ControllerActor
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.api import Assignment

@@ -9,9 +9,7 @@ import pytest
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.lookup import find_controller
-from dreamfleet.worker.addons.inspection.disturbed_rollouts import DisturbedDriveConfig
-from dreamfleet.worker.addons.inspection.measurements import DriverChoice, measure_dream_losses
-from dreamfleet.worker.addons.inspection.road_losses import RoadLossConfig
+from dreamfleet.worker.addons.inspection.subject import DriverChoice
 from tests.support.tables import cells
 
 FOUND = {"z_linear", "z_network", "zh_linear", "zh_network"}
@@ -73,4 +71,4 @@ def test_a_controller_of_another_world_model_dreams_nothing(tmp_path):
     bundle, (controller, _) = find_bundle("tiny"), find_controller("tiny", tmp_path)
     other = DriverChoice(replace(controller, bundle="0" * 64), bundle)
     with pytest.raises(UsageError):
-        measure_dream_losses(bundle, other, DisturbedDriveConfig(), RoadLossConfig(), lambda _: None)
+        other.dream_controller(bundle)

@@ -1,4 +1,4 @@
-"""Tests page_builder.py, charts.py, encoded_rollout.py, mdnrnn_sections.py and page.py."""
+"""Tests page_builder.py, encoded_rollout.py, mdnrnn_sections.py and page.py."""
 
 import json
 import re
@@ -12,7 +12,8 @@ from dreamfleet.common.errors import BundleError, DatasetError, UsageError
 from dreamfleet.worker.addons.inspection import mdnrnn_sections
 from dreamfleet.worker.addons.inspection.encoded_rollout import DriveConfig, record_drive
 from dreamfleet.worker.addons.inspection.page import Page, Section
-from dreamfleet.worker.addons.inspection.page_builder import InspectionSubject, find_subject, manifest_facts, write_page
+from dreamfleet.worker.addons.inspection.page_builder import manifest_facts, write_page
+from dreamfleet.worker.addons.inspection.subject import InspectionSubject, find_subject
 from dreamfleet.worker.worldmodel.inference import DreamStep
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae import VAEConfig

@@ -13,10 +13,11 @@ from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.work import vector_bytes
 from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.worker.addons.inspection import measurements, verb
+from dreamfleet.worker.addons.inspection.dream_comparisons import LossReport, RoadLossComparison
 from dreamfleet.worker.addons.inspection.encoded_rollout import DriveConfig, record_drive
-from dreamfleet.worker.addons.inspection.page_builder import find_subject, write_page
+from dreamfleet.worker.addons.inspection.page_builder import write_page
 from dreamfleet.worker.addons.inspection.probe import Estimate
-from dreamfleet.worker.addons.inspection.road_losses import LossReport, RoadLossComparison
+from dreamfleet.worker.addons.inspection.subject import find_subject
 from tests.support.samples import SPEC
 from tests.support.variants import controller_of
 from tests.support.verbs import run_verb
@@ -74,10 +75,11 @@ def test_a_bundle_is_shown_a_drive_of_another_ones_controller(random_bundle, tmp
 def test_a_runs_own_controller_is_measured_at_the_runs_temperature(runs_dir, random_bundle, monkeypatch):
     asked = []
     report = LossReport(1, 8, 1.0, 10, (COMPARED,))
-    monkeypatch.setattr(measurements, "measure_dream_losses", lambda *given: asked.append(given) or report)
+    monkeypatch.setattr(measurements, "collect_losing_drives", lambda *_given: [])
+    monkeypatch.setattr(measurements, "compare_losses", lambda *given: asked.append(given) or report)
     end(runs_dir, random_bundle)
     for flags, temperature in ((), 1.25), (("--temperature", "1.5"), 1.5):
         assert run_verb(verb, "night", "--losses", *flags, runs_dir=runs_dir) == 0
-        bundle, driving, _, losses, _ = asked.pop()
-        assert bundle.sha256 == driving.controller.bundle == random_bundle.sha256
+        _, bundle, controller, losses, _ = asked.pop()
+        assert bundle.sha256 == controller.bundle == random_bundle.sha256
         assert losses.temperature == temperature

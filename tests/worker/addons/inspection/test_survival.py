@@ -10,8 +10,9 @@ from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.addons.inspection import encoded_rollout
 from dreamfleet.worker.addons.inspection.encoded_rollout import DriveConfig, record_drive
-from dreamfleet.worker.addons.inspection.page_builder import InspectionSubject, manifest_facts, write_page
+from dreamfleet.worker.addons.inspection.page_builder import manifest_facts, write_page
 from dreamfleet.worker.addons.inspection.probe import Estimate
+from dreamfleet.worker.addons.inspection.subject import InspectionSubject
 from dreamfleet.worker.addons.inspection.survival import (
     PolicySurvival,
     Survival,

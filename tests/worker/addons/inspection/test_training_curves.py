@@ -1,5 +1,5 @@
 """Trainings by their loss curves: whole, stopped, gone back, side by side, damaged; what their VAEs keep of pictures.
-Tests curve_sections.py, vae_sections.py and vae_view.py."""
+Tests vae_sections.py."""
 
 import json
 import re
@@ -9,12 +9,12 @@ import pygame
 import pytest
 
 from dreamfleet.common.errors import DatasetError, MissingExtraError, UsageError
-from dreamfleet.worker.addons.inspection import curve_sections, vae_view, verb
+from dreamfleet.worker.addons.inspection import training_curves, vae_sections, verb
 from dreamfleet.worker.addons.inspection.encoded_rollout import DriveConfig
-from dreamfleet.worker.addons.inspection.page_builder import InspectionSubject, write_page
+from dreamfleet.worker.addons.inspection.page_builder import write_page
+from dreamfleet.worker.addons.inspection.subject import InspectionSubject
 from dreamfleet.worker.addons.inspection.training_curves import UNITS, load_trainings, merge_points
-from dreamfleet.worker.addons.inspection.vae_sections import fit_picture
-from dreamfleet.worker.addons.inspection.vae_view import VAEView, held_out_drive
+from dreamfleet.worker.addons.inspection.vae_sections import VAEView, fit_picture, held_out_drive
 from dreamfleet.worker.training.data.dataset import find_world, preprocessing_of_size
 from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
@@ -68,8 +68,8 @@ def test_a_completed_training_shows_batches_and_held_out_drives_of_every_loss(tr
 @pytest.mark.slow
 def test_every_line_of_a_curve_is_in_the_chart(trained, monkeypatch):
     drawn = []
-    monkeypatch.setattr(curve_sections, "render_png", drawn.append)
-    sections = curve_sections.loss_sections(load_trainings([trained, trained]))
+    monkeypatch.setattr(training_curves, "render_png", drawn.append)
+    sections = training_curves.loss_sections(load_trainings([trained, trained]))
     assert [each.name for each in sections] == ["loss-vae", "loss-mdnrnn"]
     named = list(UNITS.values())
     for figure, parts in zip(drawn, (named[:2], named[2:]), strict=True):
@@ -116,7 +116,7 @@ def test_a_curve_from_before_the_held_out_divergence_is_drawn(tmp_path):
     (found,) = load_trainings([folder])
     assert (found.updates, found.best) == (20, 20)
     assert not len(found.curves["kl"].held_out)
-    assert curve_sections.loss_sections([found])[0].picture
+    assert training_curves.loss_sections([found])[0].picture
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ def test_of_several_folders_each_shows_its_pictures_and_one_without_drives_its_l
 
 @pytest.mark.slow
 def test_without_torch_the_losses_are_drawn_and_the_extra_is_named(trained, tmp_path, monkeypatch):
-    monkeypatch.setattr(vae_view, "find_spec", lambda _name: None)
+    monkeypatch.setattr(vae_sections, "find_spec", lambda _name: None)
     page = page_of([trained], tmp_path / "page")
     assert sections(page)[-1] == "loss-mdnrnn"
     with pytest.raises(MissingExtraError):

@@ -1,7 +1,11 @@
-"""Measure whether dreams that begin shortly before a real loss of the road lose it too.
+"""Compare real drives with dreams that begin on them: do both lose the road, and are large values as frequent.
 
-Probes estimate from [z, h] whether a dream is off the road. They are also applied to real steps that they were not
-fitted on, and to dreams that begin where reality stays on the road, so that their own errors show.
+Probes estimate from [z, h] whether a dream is off the road, and other quantities. They are fitted on other drives, on
+latents predicted one step ahead. They are also applied to real steps, and to dreams that begin where reality stays on
+the road, so that their own errors show.
+
+A dream may be plausible from step to step and yet contain fewer or milder bends than the world, and controllers evolve
+for what it contains.
 """
 
 from __future__ import annotations
@@ -22,10 +26,11 @@ from dreamfleet.worker.addons.inspection.disturbed_rollouts import (
     OFFSET,
     DisturbedDrive,
     DisturbedDriveConfig,
+    DreamSegment,
+    DriveDreamer,
     first_sustained,
 )
-from dreamfleet.worker.addons.inspection.drive_dreams import DreamSegment, DriveDreamer
-from dreamfleet.worker.addons.inspection.probe import Estimate, LinearProbe, folds, other_rows
+from dreamfleet.worker.addons.inspection.probe import Estimate, LinearProbe, Table, folds
 from dreamfleet.worker.dream.world import check_temperature
 
 Floats = NDArray[np.float32]
@@ -33,6 +38,16 @@ Doubles = NDArray[np.float64]
 FOLDS = 10  # many, because linear probes are fast to fit and steps off the road are rare
 PATIENCE = 10  # most drives per wanted loss
 CALM = "no loss"  # name of the beginnings after which reality stays on the road
+BEGUN = {"0 steps before": "at the loss", CALM: "where nothing is lost"}  # clearer words for some beginnings
+WHERE = {
+    "reality": "reality",
+    "foreseen": "reality, foreseen",
+    "dream": "dream",
+    "same_actions": "dream, reality's actions",
+}
+WHAT = {"lost": "road lost", "off_at_end": "off at the end", "offset_at_end": "offset at the end", "reward": "reward"}
+RARE = 0.9  # quantile of a quantity's absolute value in reality above which it counts as rare
+SHORTEST = 100  # steps on the road that a drive must have, to be compared with dreams
 Kinds = list[tuple[str, dict[int, DreamSegment]]]
 
 
@@ -71,6 +86,20 @@ class LossReport:
     temperature: float
     lasting: int
     begun: tuple[RoadLossComparison, ...]
+
+    def table(self) -> Table:
+        """As rows, and a text that describes them."""
+        rows = [
+            {"begun": BEGUN.get(each.begun, each.begun), "n": each.count, "mean": WHAT[figure]}
+            | {WHERE[where]: str(estimate) for where, estimate in by_source.items()}
+            for each in self.begun
+            for figure, by_source in each.figures.items()
+        ]
+        return rows, (
+            f"means ± standard errors over n beginnings in {plural(self.drives, 'drive')}, "
+            f"{plural(self.dreams, 'dream')} of each. The road is lost after {plural(self.lasting, 'step')} in a row "
+            "off it, and the end is as long"
+        )
 
 
 @dataclass(frozen=True)
@@ -148,8 +177,7 @@ def compare_losses(
     dreamer = DriveDreamer(bundle, controller, config.temperature, config.dreams)
     foreseen = [dreamer.predict_next(drive) for drive in drives]
     probes = dict[int, RoadProbe]()
-    for fold in folds(len(drives), most=FOLDS):
-        rest = other_rows(fold, len(drives))
+    for fold, rest in folds(len(drives), most=FOLDS):
         probe = RoadProbe([drives[row] for row in rest], [foreseen[row][0] for row in rest], driven.opening)
         probes |= dict.fromkeys(fold, probe)
     found = []
@@ -186,14 +214,11 @@ def _dream_segments(drives: Sequence[DisturbedDrive], config: RoadLossConfig, dr
     lost = {row: drive for row, drive in enumerate(drives) if has_usable_loss(drive, config, driven)}
     kinds: Kinds = []
     for before in config.before:
-        begun = {
-            row: DreamSegment(drive, (drive.lost or 0) - before, before + driven.after) for row, drive in lost.items()
-        }
+        length = before + driven.after
+        begun = {row: DreamSegment(drive, (drive.lost or 0) - before, length) for row, drive in lost.items()}
         kinds.append((f"{plural(before, 'step')} before", begun))
-    found = {
-        row: _find_calm_stretch(drive, max(config.before) + driven.after, driven.opening)
-        for row, drive in enumerate(drives)
-    }
+    longest = max(config.before) + driven.after
+    found = {row: _find_calm_stretch(drive, longest, driven.opening) for row, drive in enumerate(drives)}
     calm = {row: each for row, each in found.items() if each is not None}
     return [*kinds, (CALM, calm)] if len(calm) > 1 else kinds
 
@@ -211,3 +236,90 @@ def has_usable_loss(drive: DisturbedDrive, config: RoadLossConfig, driven: Distu
     if drive.lost is None:
         return False
     return drive.lost - max(config.before) >= driven.opening and drive.lost + driven.after <= len(drive)
+
+
+@dataclass(frozen=True)
+class RareFrequency:
+    """One quantity: the absolute value that a tenth of real steps exceeds, and the shares of steps that exceed it.
+
+    The shares are by source: `reality` by the true state, `foreseen` by the probe on real steps predicted one step
+    ahead, `dream` by the probe on dreamt steps.
+    """
+
+    quantity: str
+    rare: float
+    found: dict[str, Estimate]
+
+
+@dataclass(frozen=True)
+class LikenessReport:
+    """Each quantity's shares, and of how many drives, dreams of each, and dreams of which temperature they are."""
+
+    drives: int
+    dreams: int
+    temperature: float
+    quantities: tuple[RareFrequency, ...]
+
+    def table(self) -> Table:
+        """As rows, and a text that describes them."""
+        rows = [
+            {"quantity": each.quantity, "rare": f"above {each.rare:.3g}"}
+            | {WHERE[where]: str(share) for where, share in each.found.items()}
+            for each in self.quantities
+        ]
+        return rows, (
+            "shares of steps ± standard errors over drives: at these a quantity is larger than at nine of ten real "
+            "steps. Measured by the truth, and by a linear probe on [z, h]. Dreams begin after each drive's opening "
+            "and last as long"
+        )
+
+
+def compare_frequencies(
+    drives: Sequence[DisturbedDrive], bundle: Bundle, controller: Controller, opening: int, dreams: int,
+    temperature: float,
+) -> LikenessReport:  # fmt: skip
+    """Compare each drive, from its opening until it leaves the road, with dreams of the same length and disturbance.
+
+    `UsageError` if fewer than two drives stay on the road for long enough.
+    """
+    begun = [each for drive in drives if (each := _dream_segment(drive, opening)) is not None]
+    if len(begun) < 2:
+        raise UsageError(f"dreams are compared with two drives at least that stay on the road for {SHORTEST} steps")
+    dreamer = DriveDreamer(bundle, controller, temperature, dreams)
+    if not (names := [name for name in begun[0].drive.truth if name != OFF]):
+        raise UsageError("the world's true state has no quantity to compare dreams with")
+    truths = [np.stack([each.drive.truth[name][each.steps] for name in names], axis=1) for each in begun]
+    foreseen = [dreamer.predict_next(each.drive)[0][each.steps] for each in begun]
+    rare = np.quantile(np.abs(np.concatenate(truths)), RARE, axis=0)
+    shares: list[dict[str, Doubles]] = []
+    for fold, rest in folds(len(begun), most=FOLDS):
+        probe = LinearProbe.fit(*(np.concatenate([each[row] for row in rest]) for each in (foreseen, truths)))
+        for row in fold:
+            dreamt = _before_ends(dreamer.dream(begun[row], own=True)[0])
+            if not len(dreamt):
+                continue
+            found = {"reality": truths[row], "foreseen": probe.predict(foreseen[row]), "dream": probe.predict(dreamt)}
+            shares.append({where: (np.abs(values) > rare).mean(axis=0) for where, values in found.items()})
+    if len(shares) < 2:
+        raise UsageError("the dreams of all drives but one end as they begin: nothing can be measured on them")
+    quantities = tuple(
+        RareFrequency(name, float(rare[row]), {w: Estimate.of([each[w][row] for each in shares]) for w in shares[0]})
+        for row, name in enumerate(names)
+    )
+    return LikenessReport(len(drives), dreams, temperature, quantities)
+
+
+def _before_ends(features: Floats) -> Floats:
+    """The steps `(steps, features)` of dreams `(dreams, steps, features)` before their ends.
+
+    After its end a dream repeats its last state.
+    """
+    still = (np.diff(features, axis=1) == 0).all(axis=2)
+    return np.asarray(features[:, 1:][~still])
+
+
+def _dream_segment(drive: DisturbedDrive, opening: int) -> DreamSegment | None:
+    """The part of a drive from its opening until it first leaves the road; `None` if that is too short."""
+    off = np.flatnonzero(drive.truth.get(OFF, np.zeros(len(drive)))[opening:] > 0)
+    length = int(off[0]) if len(off) else len(drive) - opening
+    return DreamSegment(drive, opening, length) if length >= SHORTEST else None

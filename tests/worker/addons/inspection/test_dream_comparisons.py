@@ -1,5 +1,4 @@
-"""Dreams begun before real losses of the road, judged by probes on the dream.
-Tests drive_dreams.py, likeness.py and tables.py."""
+"""Dreams begun before real losses of the road, judged by probes on the dream."""
 
 from dataclasses import replace
 
@@ -8,12 +7,15 @@ import pytest
 
 from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.addons.inspection import likeness, probe
-from dreamfleet.worker.addons.inspection.disturbed_rollouts import OFF, DisturbedDriveConfig, record_disturbed_drives
-from dreamfleet.worker.addons.inspection.drive_dreams import DreamSegment, DriveDreamer
-from dreamfleet.worker.addons.inspection.measurements import DriverChoice
-from dreamfleet.worker.addons.inspection.probe import cross_validate_probes
-from dreamfleet.worker.addons.inspection.road_losses import (
+from dreamfleet.worker.addons.inspection import dream_comparisons, probe
+from dreamfleet.worker.addons.inspection.disturbed_rollouts import (
+    OFF,
+    DisturbedDriveConfig,
+    DreamSegment,
+    DriveDreamer,
+    record_disturbed_drives,
+)
+from dreamfleet.worker.addons.inspection.dream_comparisons import (
     CALM,
     RoadLossConfig,
     RoadOutcome,
@@ -21,7 +23,8 @@ from dreamfleet.worker.addons.inspection.road_losses import (
     collect_losing_drives,
     compare_losses,
 )
-from dreamfleet.worker.addons.inspection.tables import table_of
+from dreamfleet.worker.addons.inspection.probe import cross_validate_probes
+from dreamfleet.worker.addons.inspection.subject import DriverChoice
 from dreamfleet.worker.scoring.actors import ControllerActor
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
 from tests.support.bundles import write_random_bundle
@@ -65,7 +68,7 @@ def test_reality_loses_the_road_and_the_probe_sees_it_and_nothing_where_all_is_c
         assert 0 <= lost["dream"].value <= 1
     assert compared[CALM].figures["lost"]["reality"].value == 0
     assert compared[CALM].figures["lost"]["foreseen"].value <= 0.25
-    assert len(table_of(report)[0]) == 3 * 4
+    assert len(report.table()[0]) == 3 * 4
 
 
 def test_a_dream_begins_at_its_real_step_and_is_a_function_of_seed_and_step(drives, tiny, controller):
@@ -122,12 +125,12 @@ def test_a_world_model_knows_yaw_from_what_it_remembers_not_from_a_picture(drive
     assert OFF not in known
     assert known["yaw_rate"]["zh_linear"].value > 0.8 > known["yaw_rate"]["z_linear"].value + 0.2
     assert known["lateral_offset"]["z_linear"].value > 0.5
-    assert [row["quantity"] for row in table_of(knowledge)[0]] == list(known)
+    assert [row["quantity"] for row in knowledge.table()[0]] == list(known)
 
 
 @pytest.mark.slow
 def test_a_dream_is_held_to_what_is_rare_in_reality(drives, tiny, controller, monkeypatch):
-    report = likeness.compare_frequencies(drives, tiny, controller, DRIVEN.opening, 2, 1.0)
+    report = dream_comparisons.compare_frequencies(drives, tiny, controller, DRIVEN.opening, 2, 1.0)
     found = {each.quantity: each for each in report.quantities}
     assert OFF not in found
     for each in found.values():
@@ -136,16 +139,16 @@ def test_a_dream_is_held_to_what_is_rare_in_reality(drives, tiny, controller, mo
     assert found["yaw_rate"].found["foreseen"].value == pytest.approx(0.1, abs=0.05)
     assert found["speed"].rare > 20
     with pytest.raises(UsageError, match="100"):
-        likeness.compare_frequencies(drives[:1], tiny, controller, DRIVEN.opening, 2, 1.0)
-    monkeypatch.setattr(likeness, "_before_ends", lambda features: features[0, :0])
+        dream_comparisons.compare_frequencies(drives[:1], tiny, controller, DRIVEN.opening, 2, 1.0)
+    monkeypatch.setattr(dream_comparisons, "_before_ends", lambda features: features[0, :0])
     with pytest.raises(UsageError):  # all dreams end as they begin
-        likeness.compare_frequencies(drives, tiny, controller, DRIVEN.opening, 2, 1.0)
+        dream_comparisons.compare_frequencies(drives, tiny, controller, DRIVEN.opening, 2, 1.0)
 
 
 def test_steps_behind_a_dreams_end_do_not_count():
     features = np.arange(24.0).reshape(2, 4, 3)
     features[1, 2:] = features[1, 1]
-    assert likeness._before_ends(features).tolist() == [*features[0, 1:].tolist(), features[1, 1].tolist()]
+    assert dream_comparisons._before_ends(features).tolist() == [*features[0, 1:].tolist(), features[1, 1].tolist()]
 
 
 def test_one_drive_is_too_few_to_fit_and_judge(drives):
