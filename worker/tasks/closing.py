@@ -14,6 +14,7 @@ import gymnasium
 from dreamfleet.common.host.foreign_code import contained
 from dreamfleet.common.printable import one_line
 
+Environment = gymnasium.Env[Any, Any]
 log = logging.getLogger(__name__)
 MAX_TEXT = 300  # characters of a fault
 CLOSE_LIMIT = 10.0  # seconds
@@ -36,7 +37,7 @@ class _Hung(BaseException):  # not an Exception, which an environment may catch
     """Interrupts a `close` that hangs."""
 
 
-def close_environment(environment: gymnasium.Env[Any, Any]) -> str:
+def close_environment(environment: Environment) -> str:
     """Close an environment; what its `close` raises is logged as a warning and returned, empty if it raises nothing.
 
     It is interrupted after `CLOSE_LIMIT` seconds, unless native code hangs or this is not the main thread. Other
@@ -60,6 +61,15 @@ def close_environment(environment: gymnasium.Env[Any, Any]) -> str:
     if fault:
         log.warning("%s", fault)
     return fault
+
+
+@contextmanager
+def closing_environment(environment: Environment) -> Iterator[Environment]:
+    """The environment, which is closed by `close_environment` when the `with` ends."""
+    try:
+        yield environment
+    finally:
+        close_environment(environment)
 
 
 @contextmanager

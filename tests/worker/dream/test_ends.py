@@ -65,7 +65,9 @@ def test_dreams_beside_a_drive_and_from_a_moment_end_by_the_rule_too(choices_bun
         begun.append(beside.since)
     assert len(set(begun)) == pytest.approx(400, abs=40)
     continued = DreamContinuation(bundle, 1.0)
-    found = [len(list(continued.dream(latent, state[0], parameters, seed))) for seed in range(400)]
+    found = [
+        len(list(continued.dream(latent, state[0], parameters, continued.make_noise(seed)))) for seed in range(400)
+    ]
     assert np.mean(found) == pytest.approx(4, abs=0.7)  # those before the end
 
 

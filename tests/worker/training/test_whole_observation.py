@@ -8,7 +8,7 @@ import pytest
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.worker.addons.driving.scene import DreamScene
+from dreamfleet.worker.addons.driving.loop import DreamScene
 from dreamfleet.worker.addons.evaluation.agents import make_agent
 from dreamfleet.worker.addons.recording.recording import record
 from dreamfleet.worker.scoring.episode import EpisodeConfig, score

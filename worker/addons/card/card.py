@@ -17,7 +17,7 @@ from dreamfleet.worker.addons.card import card_page
 from dreamfleet.worker.addons.evaluation.agents import Agent, make_agent, make_evaluation_spec
 from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
 from dreamfleet.worker.addons.evaluation.known_score import first_seed
-from dreamfleet.worker.addons.recording.video_cli import MOST_STEPS
+from dreamfleet.worker.addons.recording.verb import MOST_STEPS
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_scored_task, task_of
 

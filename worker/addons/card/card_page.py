@@ -118,11 +118,8 @@ def _describe_controller(contents: CardContents) -> str:
         text += f"The Python package `dreamfleet` imported it from another program's file, {_code(str(source))}."
     if bundle is not None:
         hidden = f" and memory ({bundle.manifest.hidden})" if controller.shape.features > bundle.manifest.latent else ""
-        text += (
-            f" It sees a world model's latent ({plural(bundle.manifest.latent, 'number')}){hidden}, of the "
-            "frozen VAE and "
-            f"MDN-RNN in `{BUNDLE}`."
-        )
+        latent = plural(bundle.manifest.latent, "number")
+        text += f" It sees a world model's latent ({latent}){hidden}, of the frozen VAE and MDN-RNN in `{BUNDLE}`."
     return text
 
 
@@ -145,23 +142,19 @@ def _describe_script(contents: CardContents) -> Iterator[str]:
     if contents.difference == 0:
         yield "On the host that wrote this card, its actions and dreamfleet's are bit-identical."
     elif contents.difference is not None:
-        yield (
-            f"Its actions differ from dreamfleet's by about {contents.difference:.1g}: dreamfleet computes such "
-            "controllers in NumPy."
-        )
+        differ = f"Its actions differ from dreamfleet's by about {contents.difference:.1g}"
+        yield f"{differ}: dreamfleet computes such controllers in NumPy."
     yield ""
 
 
 def _origin(controller: Controller, bundle: Bundle | None) -> dict[str, Any]:
-    known: dict[str, Any] = {
-        name: controller.provenance[key] for key, name in ORIGINS.items() if key in controller.provenance
-    }
+    facts = controller.provenance
     return {
         "controller_sha256": controller.sha256,
         "bundle_sha256": "" if bundle is None else bundle.sha256,
         "options": controller.options,
         "dreamfleet": package_version("dreamfleet"),
-        **known,
+        **{name: facts[key] for key, name in ORIGINS.items() if key in facts},
     }
 
 

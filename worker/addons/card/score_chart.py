@@ -38,9 +38,8 @@ def draw_scores(report: EvaluationReport, name: str) -> bytes:
     points.set(xlabel=f"seed of the {word}" if word != "seed" else "seed", ylabel="score")
     counts.set(xlabel=f"{word}s")
     figure.legend(handles=lines, loc="outside lower right", ncols=2, frameon=False, fontsize=9)
-    title = (
-        f"{name}: {format_with_error(found.mean, found.error)} (standard error) on {plural(len(found.drives), word)}"
-    )
+    mean_text = format_with_error(found.mean, found.error)
+    title = f"{name}: {mean_text} (standard error) on {plural(len(found.drives), word)}"
     figure.suptitle(title, fontsize=11, x=0.01, ha="left", parse_math=False)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})

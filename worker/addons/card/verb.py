@@ -13,7 +13,7 @@ from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.stop_signals import stop_on_signals
 from dreamfleet.common.host.unseen_drawing import draw_unseen
-from dreamfleet.worker.addons.recording.video_cli import MOST_STEPS
+from dreamfleet.worker.addons.recording.verb import MOST_STEPS
 
 SUMMARY = "write a controller as a folder to publish: a model card, scores, a video, ONNX, a script without dreamfleet"
 EXTRAS = ("worker", "views", "export")
@@ -56,12 +56,7 @@ def run(args: argparse.Namespace) -> int:
         files = write_card(contents, args.out, args.steps, bar.update if bar else lambda _steps: None, stop)
         if bar and contents.filmed:
             bar.end(contents.filmed.steps)
-    without = [f"; without {name}: {why}" for name, why in contents.missing.items()]
-    print_answer(
-        args,
-        f"{args.out}: {', '.join(files)}{''.join(without)}",
-        folder=args.out,
-        files=files,
-        missing=contents.missing,
-    )
+    without = "".join(f"; without {name}: {why}" for name, why in contents.missing.items())
+    text = f"{args.out}: {', '.join(files)}{without}"
+    print_answer(args, text, folder=args.out, files=files, missing=contents.missing)
     return 0

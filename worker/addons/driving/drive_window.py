@@ -6,7 +6,6 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal
 
@@ -25,16 +24,6 @@ LEFT, RIGHT = (pygame.K_LEFT, pygame.K_a), (pygame.K_RIGHT, pygame.K_d)
 GAS, BRAKE = (pygame.K_UP, pygame.K_w), (pygame.K_DOWN, pygame.K_s)
 BRAKE_STRENGTH = 0.8  # as gymnasium's own keyboard control: at 1 the wheels lock
 WindowCommand = Literal["again", "quit"]
-
-
-@dataclass(frozen=True)
-class DriveStatus:
-    """The numbers below the picture."""
-
-    score: float
-    step: int
-    steps: int
-    over: bool
 
 
 class Pedals:
@@ -67,9 +56,8 @@ class DriveWindow:
         width = max(self._size[0], MIN_WIDTH)
         self._left = (width - self._size[0]) // 2
         self._name = name
-        self._screen = open_display(
-            (width, self._size[1] + BAR_HEIGHT), "drive where there is one, or through `ssh -X`"
-        )
+        size = width, self._size[1] + BAR_HEIGHT
+        self._screen = open_display(size, "drive where there is one, or through `ssh -X`")
         pygame.font.init()
         self._large, self._small = pygame.font.Font(None, 30), pygame.font.Font(None, 22)
         self._clock = pygame.time.Clock()
@@ -91,18 +79,16 @@ class DriveWindow:
             elif event.type == pygame.KEYDOWN and event.key == pygame.K_r:
                 yield "again"
 
-    def show(self, picture: pygame.Surface, status: DriveStatus) -> None:
-        """Draw, and wait until the next frame is due."""
+    def show(self, picture: pygame.Surface, score: float, step: int, steps: int, *, over: bool) -> None:
+        """Draw the picture above these numbers, and wait until the next frame is due."""
         self._screen.fill(BACKGROUND)
         fitting = picture if picture.get_size() == self._size else pygame.transform.scale(picture, self._size)
         self._screen.blit(fitting, (self._left, 0))
         top, rate = self._size[1], self._clock.get_fps()
-        pace = "over" if status.over else f"{rate:.0f} frames/s, {rate / FRAMES_PER_SECOND:.1f} x time"
-        self._text(
-            f"score {status.score:z.1f}   step {status.step} of {status.steps}   {pace}", top + 10, self._large, INK
-        )
+        pace = "over" if over else f"{rate:.0f} frames/s, {rate / FRAMES_PER_SECOND:.1f} x time"
+        self._text(f"score {score:z.1f}   step {step} of {steps}   {pace}", top + 10, self._large, INK)
         self._text("arrows or WASD: drive    R: again    Esc or Q: quit", top + 38, self._small, FAINT)
-        caption = f"dreamfleet: {self._name}{', over' if status.over else ''}"
+        caption = f"dreamfleet: {self._name}{', over' if over else ''}"
         if caption != self._caption:
             pygame.display.set_caption(caption)
             self._caption = caption

@@ -1,16 +1,69 @@
-"""Driving by hand: the loop that steps an environment with the keys of a window."""
+"""Driving by hand: the environments, how they are drawn, and the loop that steps one with the keys of a window."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
 
+import gymnasium
 import numpy as np
+import pygame
 
+from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.addons.driving.drive_window import DriveStatus, DriveWindow
-from dreamfleet.worker.addons.driving.scene import Scene
-from dreamfleet.worker.tasks.closing import close_environment
+from dreamfleet.worker.addons.driving.drive_window import DriveWindow
+from dreamfleet.worker.dream.environment import Dream
+from dreamfleet.worker.tasks.closing import closing_environment
+from dreamfleet.worker.tasks.registry import find_task
+
+WIDTH = 640  # pixels of a dream's picture on a screen
+
+
+class Scene(Protocol):
+    """An environment that takes steering, gas and brake, with its picture."""
+
+    name: str
+    scale: float  # from the picture to a suitable size on a screen
+    environment: gymnasium.Env[Any, Any]
+
+    def surface(self) -> pygame.Surface:
+        """The current picture."""
+
+
+@runtime_checkable
+class TaskWithScene(Protocol):
+    """Optional: a task in whose world a person drives, by steering, gas and brake.
+
+    >>> isinstance(find_task("car-racing"), TaskWithScene)
+    True
+    """
+
+    def make_scene(self, steps: int) -> Scene:
+        """A new scene, which ends after so many steps at most."""
+
+
+def make_scene(task: str, steps: int) -> Scene:
+    """The scene of a task's world; `UsageError` if nobody drives in it by hand."""
+    found = find_task(task)
+    if not isinstance(found, TaskWithScene):
+        raise UsageError(f"task {task} has no driving by hand")
+    return found.make_scene(steps)
+
+
+class DreamScene:
+    """A bundle's dream, decoded."""
+
+    name = "a dream"
+
+    def __init__(self, bundle: Bundle, temperature: float, steps: int) -> None:
+        self.scale = WIDTH / bundle.manifest.picture[1]
+        self.environment: gymnasium.Env[Any, Any] = Dream(bundle, temperature, steps, "rgb_array")
+
+    def surface(self) -> pygame.Surface:
+        """The decoded latent."""
+        picture: Any = self.environment.render()
+        return pygame.surfarray.make_surface(np.transpose(picture, (1, 0, 2)))
 
 
 @dataclass(frozen=True)
@@ -45,15 +98,14 @@ def drive(
     """
     environment = scene.environment
     environment.reset(seed=config.seed)
-    picture = scene.surface()
-    score, step, over = 0.0, 0, False
-    with DriveWindow(scene.name, picture.get_size(), config.scale or scene.scale) as window:
+    picture, score, step, over = scene.surface(), 0.0, 0, False
+    window = DriveWindow(scene.name, picture.get_size(), config.scale or scene.scale)
+    with closing_environment(environment), window:
         while True:
             for command in window.read_commands():
                 if not over:
                     yield DriveResult(score, step)
                 if command == "quit":
-                    close_environment(environment)
                     return
                 environment.reset(seed=config.seed)
                 score, step, over = 0.0, 0, False
@@ -63,10 +115,5 @@ def drive(
                 picture = scene.surface()
                 if over:
                     yield DriveResult(score, step)
-            window.show(picture, DriveStatus(score, step, config.steps, over))
+            window.show(picture, score, step, config.steps, over=over)
             on_frame(step)
-
-
-def random_seed() -> int:
-    """A random seed."""
-    return int(np.random.default_rng().integers(10_000))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from secrets import randbelow
 
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
@@ -32,10 +33,9 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.common.artifacts.driving import FIRST_WORLD
     from dreamfleet.common.printable import format_number, plural
-    from dreamfleet.worker.addons.driving.loop import DrivingConfig, drive, random_seed
-    from dreamfleet.worker.addons.driving.scene import DreamScene, Scene, make_scene
+    from dreamfleet.worker.addons.driving.loop import DreamScene, DrivingConfig, Scene, drive, make_scene
 
-    config = DrivingConfig(random_seed() if args.seed is None else args.seed, args.steps, args.scale)
+    config = DrivingConfig(randbelow(10_000) if args.seed is None else args.seed, args.steps, args.scale)
     scene: Scene
     if args.dream:
         temperature = TEMPERATURE if args.temperature is None else args.temperature

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 import pygame
 
@@ -18,11 +18,7 @@ from dreamfleet.common.files.atomic_write import check_output_path, open_output,
 from dreamfleet.worker.addons.live.live_view import CaptionedFrame
 from dreamfleet.worker.addons.recording.canvas import Frame
 
-if TYPE_CHECKING:  # it needs a package of the extra `views`
-    from dreamfleet.worker.addons.recording.video import Video
-
 VIDEO = ".mp4"
-
 
 SendFrame = Callable[[CaptionedFrame | None], bool]
 """Writes a frame (`None`: there is none yet); returns whether the viewer wants more."""
@@ -33,44 +29,41 @@ def open_sink(out: str, rate: int, stdout: BinaryIO) -> Iterator[SendFrame]:
     """Open what `--out` names: a video file, a folder, or `-`; `UsageError` if it cannot be written."""
     path = Path(out).absolute()  # a simulator may change the current folder of its process
     if out == "-":
-        yield lambda shown: shown is None or _write_part(stdout, shown)
+        # Parts of `multipart/x-mixed-replace`, which browsers show in an image.
+        yield _sender(lambda shown: write_part(stdout, encode_picture(shown.picture, "jpg"), shown.facts))
     elif path.suffix == VIDEO:
-        from dreamfleet.worker.addons.recording.video import Video
+        from dreamfleet.worker.addons.recording.video import Video  # it needs a package of the extra `views`
 
         check_output_path(path)
         with Video(path, rate, keep_partial=True) as video:
-            yield lambda shown: shown is None or _write_frame(video, shown)
+            yield _sender(lambda shown: video.add(shown.picture))
     elif path.suffix or path.is_file():
         raise UsageError(f"--out {out}: name an .mp4, a folder for pictures, or - for a stream of them")
     else:
         with reporting_write_errors(path):
             path.mkdir(parents=True, exist_ok=True)
         numbers = count()
-        yield lambda shown: shown is None or _write_picture(path / f"{next(numbers):06d}.png", shown)
+        yield _sender(lambda shown: _write_picture(path / f"{next(numbers):06d}.png", shown))
 
 
-def _write_frame(video: Video, shown: CaptionedFrame) -> bool:
-    """Add a frame to the video."""
-    video.add(shown.picture)
-    return True
+def _sender(write: Callable[[CaptionedFrame], None]) -> SendFrame:
+    def send(shown: CaptionedFrame | None) -> bool:
+        try:
+            if shown is not None:
+                write(shown)
+        except BrokenPipeError:  # the reader of a stream is gone
+            return False
+        return True
+
+    return send
 
 
-def _write_part(out: BinaryIO, shown: CaptionedFrame) -> bool:
-    """Write a part of `multipart/x-mixed-replace`, which browsers show in an image; false if the reader is gone."""
-    try:
-        write_part(out, encode_picture(shown.picture, "jpg"), shown.facts)
-    except BrokenPipeError:
-        return False
-    return True
-
-
-def _write_picture(path: Path, shown: CaptionedFrame) -> bool:
+def _write_picture(path: Path, shown: CaptionedFrame) -> None:
     """Write a PNG, and its facts as JSON beside it."""
     with open_output(path) as file:
         file.write(encode_picture(shown.picture, "png"))
     with open_output(path.with_suffix(".json")) as file:
         file.write(f"{json.dumps(shown.facts)}\n".encode())
-    return True
 
 
 def encode_picture(picture: Frame, kind: str) -> bytes:

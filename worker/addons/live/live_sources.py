@@ -12,10 +12,9 @@ from dreamfleet.common.addons.frames.live import LiveView
 from dreamfleet.worker.addons.evaluation.agents import Agent
 from dreamfleet.worker.addons.live.live_view import CaptionedFrame, LiveCanvas
 from dreamfleet.worker.addons.recording.canvas import Frame
-from dreamfleet.worker.addons.recording.drive_frames import FilmedPolicy, FramePainter, WorldModelView, episode_errors
+from dreamfleet.worker.addons.recording.drive_frames import film
 from dreamfleet.worker.addons.recording.parallel_dream import ParallelDreamConfig
-from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
-from dreamfleet.worker.tasks.closing import close_environment
+from dreamfleet.worker.tasks.closing import closing_environment
 
 Driver = tuple[Agent, dict[str, Any]]
 """An agent, and the facts about it for captions."""
@@ -44,32 +43,22 @@ def driven_frames(
     """
     for track in count(seed):
         agent, facts = driver()
-        environment = agent.make_evaluation_environment("rgb_array")
-        try:
-            with episode_errors(track):
-                yield from _episode(agent, facts, environment, replace(dreaming, seed=track), rate)
-        finally:
-            close_environment(environment)
+        with closing_environment(agent.make_evaluation_environment("rgb_array")) as environment:
+            yield from _episode(agent, facts, environment, replace(dreaming, seed=track), rate)
 
 
 def _episode(
     agent: Agent, facts: dict[str, Any], environment: Any, dreaming: ParallelDreamConfig, rate: float
 ) -> Iterator[CaptionedFrame]:
     """Frames of one episode; its seed is also the dream's."""
-    seed, world, drawn = dreaming.seed, agent.world, list[Frame]()
-    policy: Any = agent.make_policies()(seed)
-    policy.begin(agent.parameters)
-    model_view = None if agent.bundle is None else WorldModelView(agent.bundle, policy, agent.parameters, dreaming)
+    world, drawn, score, facts = agent.world, list[Frame](), 0.0, {**facts, "seed": dreaming.seed}
     every = max(1, round(world.frames_per_second / rate))
-    filmed = FilmedPolicy(policy, FramePainter(environment, agent, seed, drawn.append, every), model_view)
-    score = 0.0
-    for moment in run_episode(environment, filmed, EpisodeConfig(seed, world.horizon)):
+    for moment in film(agent, environment, dreaming, world.horizon, drawn.append, every):
         if drawn:
-            yield CaptionedFrame(drawn.pop(), {**facts, "seed": seed, "step": moment.step - 1, "score": score})
+            yield CaptionedFrame(drawn.pop(), {**facts, "step": moment.step - 1, "score": score})
         score += moment.reward
-    filmed.end(moment)
     for picture in drawn:
-        yield CaptionedFrame(picture, {**facts, "seed": seed, "step": moment.step, "score": score})
+        yield CaptionedFrame(picture, {**facts, "step": moment.step, "score": score})
 
 
 def limit_rate(pictures: Iterator[CaptionedFrame], rate: float) -> Iterator[CaptionedFrame]:

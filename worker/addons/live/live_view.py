@@ -67,7 +67,8 @@ class LiveDreamer:
         moment = live.latent, live.state, live.parameters
         if not self._continuation.fits(*moment):
             return {}
-        steps = islice(self._continuation.dream(*moment, live.frame.seed), max(AHEAD))
+        noise = self._continuation.make_noise(live.frame.seed)
+        steps = islice(self._continuation.dream(*moment, noise), max(AHEAD))
         return {ahead: latent[0] for ahead, latent in enumerate(steps, 1) if ahead in AHEAD}
 
 

@@ -174,7 +174,6 @@ def _drive_pictures(args: argparse.Namespace, driver: Callable[[], Driver]) -> I
 
 
 def _best_driver(client: Client, run: str) -> Driver:
-    """The run's current best mean."""
     from dreamfleet.worker.addons.evaluation.agents import make_agent
     from dreamfleet.worker.service.bundle_fetch import fetch_bundle_of
 
@@ -184,7 +183,6 @@ def _best_driver(client: Client, run: str) -> Driver:
 
 
 def _named_driver(args: argparse.Namespace) -> Callable[[], Driver]:
-    """The controller of `--controller`."""
     from dreamfleet.common.runs.lookup import find_bundle_of, find_evaluated_mean
     from dreamfleet.worker.addons.evaluation.agents import make_agent
 

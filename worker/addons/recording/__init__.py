@@ -1,3 +1,3 @@
 """Videos of drives and dreams."""
 
-__all__ = ["verb", "video_cli", "recording", "drive_frames", "canvas", "parallel_dream", "video"]
+__all__ = ["verb", "recording", "drive_frames", "canvas", "parallel_dream", "video"]

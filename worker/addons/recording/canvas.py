@@ -48,20 +48,13 @@ def plain_layout(picture: Frame) -> FrameLayout:
 
 
 @dataclass(frozen=True)
-class DreamPicture:
-    """A dreamt picture, and the step of the drive at which the dream started."""
-
-    picture: Frame
-    since: int
-
-
-@dataclass(frozen=True)
 class ModelPictures:
-    """The picture that a world model sees, the decoded latent, and the dreamt picture."""
+    """The picture that a world model sees, the decoded latent, and the picture that it dreams `since` a step."""
 
     seen: Frame
     decoded: Frame
-    dreamt: DreamPicture
+    dreamt: Frame
+    since: int
 
 
 @dataclass(frozen=True)
@@ -179,7 +172,7 @@ class Canvas(Board):
         column = (
             ("what the model sees", pictures.seen),
             ("what it decodes", pictures.decoded),
-            (f"dreaming since step {pictures.dreamt.since}", pictures.dreamt.picture),
+            (f"dreaming since step {pictures.since}", pictures.dreamt),
         )
         for row, (label, picture) in enumerate(column):
             left, top = self._layout.track[0] + 20, MARGIN + row * (LABEL + SIDE + GAP)

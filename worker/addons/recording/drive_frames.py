@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -16,17 +16,9 @@ from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.worlds.profile import End
 from dreamfleet.common.worlds.score_words import profile_of
 from dreamfleet.worker.addons.evaluation.agents import Agent
-from dreamfleet.worker.addons.recording.canvas import (
-    DREAMING,
-    Canvas,
-    DreamPicture,
-    DriveFrame,
-    Frame,
-    ModelPictures,
-    plain_layout,
-)
+from dreamfleet.worker.addons.recording import canvas
 from dreamfleet.worker.addons.recording.parallel_dream import ParallelDream, ParallelDreamConfig
-from dreamfleet.worker.scoring.episode import Transition
+from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition, run_episode
 from dreamfleet.worker.scoring.failure_cause import failure_of
 from dreamfleet.worker.tasks.pictures import drawn_pixels
 from dreamfleet.worker.worldmodel.inference import Decoder
@@ -45,32 +37,42 @@ class WorldModelView:
         """Dream this step; `state` is the policy's before it acted."""
         self._imagined = self._parallel_dream.follow(step, self._policy.latent, state)
 
-    def pictures(self, seen: NDArray[np.uint8]) -> ModelPictures:
+    def pictures(self, seen: NDArray[np.uint8]) -> canvas.ModelPictures:
         """The pictures of the step that was followed last; `seen` is its observation."""
-        dreamt = DreamPicture(self._decoder.decode(self._imagined)[0], self._parallel_dream.since)
-        return ModelPictures(seen, self._decoder.decode(self._policy.latent)[0], dreamt)
+        decoded, dreamt = (self._decoder.decode(each)[0] for each in (self._policy.latent, self._imagined))
+        return canvas.ModelPictures(seen, decoded, dreamt, self._parallel_dream.since)
 
 
 class FilmedPolicy:
-    """Wraps a policy and paints frames of its steps, each before its action, and of the episode's end."""
+    """Wraps an agent's policy: draws frames of its steps, each before its action, and of the end, all of one size."""
 
-    def __init__(self, policy: Any, painter: FramePainter, model_view: WorldModelView | None) -> None:
-        self._policy, self._painter, self._model_view = policy, painter, model_view
+    def __init__(
+        self, agent: Agent, environment: gymnasium.Env[Any, Any], dreaming: ParallelDreamConfig,
+        on_frame: Callable[[canvas.Frame], None], every: int,
+    ) -> None:  # fmt: skip
+        """`every` is the number of steps between two frames, `dreaming.seed` the episode's."""
+        self._environment, self._seed, self._on_frame, self._every = environment, dreaming.seed, on_frame, every
+        self._world, parameters, bundle = agent.world, agent.parameters, agent.bundle
+        self._policy: Any = agent.make_policies()(dreaming.seed)
+        self._policy.begin(parameters)
+        self._view = None if bundle is None else WorldModelView(bundle, self._policy, parameters, dreaming)
+        self._profile = replace(profile_of(agent.reality), score_word=agent.world.score_word)
         self._step, self._score = 0, 0.0
+        self._canvas: canvas.Canvas | None = None
+        self._last: canvas.DriveFrame | None = None
 
     def begin(self, parameters: NDArray[np.float32]) -> None:
         """Begin an episode."""
         self._policy.begin(parameters)
 
     def act(self, observation: Any) -> Any:
-        """The policy's action; paint a frame if one is due."""
+        """The policy's action; draw a frame if one is due."""
         state = getattr(self._policy, "state", None)
         action = self._policy.act(observation)
-        if self._model_view is not None:
-            self._model_view.follow(self._step, state)
-        if self._step % self._painter.every == 0:
-            pictures = None if self._model_view is None else self._model_view.pictures(observation)
-            self._painter.add(action, self._step, self._score, pictures)
+        if self._view is not None:
+            self._view.follow(self._step, state)
+        if self._step % self._every == 0:
+            self._draw(observation, action)
         self._step += 1
         return action
 
@@ -82,37 +84,10 @@ class FilmedPolicy:
             report_reward(value)
 
     def end(self, last: Transition) -> None:
-        """Paint the end of an episode that its environment ended; `last` is its last step."""
-        if last.ended:
-            self._painter.hold_end(last, self._score)
-
-
-class FramePainter:
-    """Draws frames of one drive, all of the same size, and passes them to `on_frame`."""
-
-    def __init__(
-        self, environment: gymnasium.Env[Any, Any], agent: Agent, seed: int, on_frame: Callable[[Frame], None],
-        every: int = 1,
-    ) -> None:  # fmt: skip
-        """`every` is the number of steps between two frames."""
-        self.every = every
-        self._environment, self._world, self._seed, self._on_frame = environment, agent.world, seed, on_frame
-        self._profile = replace(profile_of(agent.reality), score_word=agent.world.score_word)
-        self._canvas: Canvas | None = None
-        self._last: DriveFrame | None = None
-
-    def add(self, action: Any, step: int, score: float, pictures: ModelPictures | None) -> None:
-        """Draw the frame of a step."""
-        picture = self._picture()
-        if self._canvas is None:
-            layout = DREAMING if pictures is not None else plain_layout(picture)
-            self._canvas = Canvas(self._seed, self._profile, layout, self._world.action_names, self._world.actions)
-        self._last = DriveFrame(picture, np.atleast_1d(np.asarray(action)), step, score, pictures)
-        self._on_frame(self._canvas.draw(self._last))
-
-    def hold_end(self, last: Transition, score: float) -> None:
-        """Draw what was painted last as the episode's end, for a second: its last picture, score and how it ended."""
-        assert self._canvas is not None  # the first step was painted
+        """Draw an end that the environment gave, for a second: the last picture, the score and how it ended."""
+        if not last.ended:
+            return
+        assert self._canvas is not None  # the first step was drawn
         assert self._last is not None
         picture = self._last.track
         with suppress(Exception):  # of an environment that draws no picture after its end
@@ -120,10 +95,19 @@ class FramePainter:
         end: End = "terminated" if last.terminal else "truncated"
         if self._world.finish and last.info.get(self._world.finish):
             end = "finished"
-        text = self._profile.describe_end(end, score, last.step)
-        frame = self._canvas.draw(replace(self._last, track=picture, step=last.step, score=score, end=text))
-        for _ in range(max(1, round(self._world.frames_per_second / self.every))):
+        text = self._profile.describe_end(end, self._score, last.step)
+        frame = self._canvas.draw(replace(self._last, track=picture, step=last.step, score=self._score, end=text))
+        for _ in range(max(1, round(self._world.frames_per_second / self._every))):
             self._on_frame(frame)
+
+    def _draw(self, observation: Any, action: Any) -> None:
+        picture, pictures = self._picture(), None if self._view is None else self._view.pictures(observation)
+        if self._canvas is None:
+            layout = canvas.DREAMING if pictures is not None else canvas.plain_layout(picture)
+            named = self._world.action_names, self._world.actions
+            self._canvas = canvas.Canvas(self._seed, self._profile, layout, *named)
+        self._last = canvas.DriveFrame(picture, np.atleast_1d(np.asarray(action)), self._step, self._score, pictures)
+        self._on_frame(self._canvas.draw(self._last))
 
     def _picture(self) -> NDArray[np.uint8]:
         """The environment's picture `(height, width, 3)`; `UsageError` if it draws none."""
@@ -139,12 +123,21 @@ class FramePainter:
         return found
 
 
-@contextmanager
-def episode_errors(seed: int) -> Iterator[None]:
-    """Turn what a simulator raises into a `DreamfleetError` that names the seed."""
+def film(
+    agent: Agent, environment: gymnasium.Env[Any, Any], dreaming: ParallelDreamConfig, steps: int,
+    on_frame: Callable[[canvas.Frame], None], every: int = 1,
+) -> Iterator[Transition]:  # fmt: skip
+    """Drive an episode of at most so many steps; yield each, whose frame `on_frame` got before, if one was due.
+
+    `dreaming.seed` is the seed of both. An episode's end is held for a second. `DreamfleetError` names the seed where a
+    simulator raises anything.
+    """
     try:
-        yield
+        filmed = FilmedPolicy(agent, environment, dreaming, on_frame, every)
+        for moment in run_episode(environment, filmed, EpisodeConfig(dreaming.seed, steps)):
+            yield moment
+        filmed.end(moment)
     except DreamfleetError:
         raise
     except (Exception, SystemExit) as error:  # a simulator may raise anything
-        raise DreamfleetError(f"the episode of seed {seed} failed: {failure_of(error).text}") from error
+        raise DreamfleetError(f"the episode of seed {dreaming.seed} failed: {failure_of(error).text}") from error

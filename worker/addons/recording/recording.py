@@ -17,12 +17,11 @@ from dreamfleet.common.host.stall_watch import STALL_SECONDS
 from dreamfleet.common.host.stop_signals import Stop, never_stop
 from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.worker.addons.evaluation.agents import Agent
-from dreamfleet.worker.addons.recording.drive_frames import FilmedPolicy, FramePainter, WorldModelView, episode_errors
+from dreamfleet.worker.addons.recording.drive_frames import film
 from dreamfleet.worker.addons.recording.parallel_dream import ParallelDreamConfig
 from dreamfleet.worker.addons.recording.video import Video
-from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.scoring.failure_cause import crash, failure_of
-from dreamfleet.worker.tasks.closing import close_environment
+from dreamfleet.worker.tasks.closing import closing_environment
 
 
 def record(
@@ -34,34 +33,26 @@ def record(
     With a world model, the video also shows what the model sees, decodes and, if it can, dreams. An episode's end is
     held for a second. If `stop()` turns true, the video ends early, after at least one step.
     """
-    config, bundle = replace(dreaming or ParallelDreamConfig(), seed=seed), agent.bundle
+    config = replace(dreaming or ParallelDreamConfig(), seed=seed)
     score = 0.0
     environment = agent.make_evaluation_environment("rgb_array")  # first of all: what follows asks the open one
-    try:
-        policy: Any = agent.make_policies()(seed)
-        policy.begin(agent.parameters)
-        model_view = None if bundle is None else WorldModelView(bundle, policy, agent.parameters, config)
-        with episode_errors(seed), Video(out, agent.world.frames_per_second) as video:
-            filmed = FilmedPolicy(policy, FramePainter(environment, agent, seed, video.add), model_view)
-            for moment in run_episode(environment, filmed, EpisodeConfig(seed, steps)):
-                score += moment.reward
-                on_step(moment.step)
-                if stop():
-                    break
-            filmed.end(moment)
-    finally:
-        close_environment(environment)
+    with closing_environment(environment), Video(out, agent.world.frames_per_second) as video:
+        for moment in film(agent, environment, config, steps, video.add):
+            score += moment.reward
+            on_step(moment.step)
+            if stop():
+                break
     return score
 
 
 def record_in_process(
-    film: partial[float], seed: int, out: Path, on_step: Callable[[int], None], stop: Stop,
+    record_here: partial[float], seed: int, out: Path, on_step: Callable[[int], None], stop: Stop,
     stall: float = STALL_SECONDS,
 ) -> tuple[float, int]:  # fmt: skip
-    """Record an episode in a child process; return its score and its steps. `film` is `record` without what is here.
+    """Record an episode in a child process; return its score and its steps.
 
-    `DreamfleetError` if the episode fails, ends its process, or makes no step for `stall` seconds; then `out` is as it
-    was before. `on_step` is called about once a second.
+    `record_here` is `record` without what is given here. `DreamfleetError` if the episode fails, ends its process, or
+    makes no step for `stall` seconds; then `out` is as it was before. `on_step` is called about once a second.
     """
     is_stopped = get_context("spawn").Value("B", 0, lock=False)
 
@@ -74,7 +65,7 @@ def record_in_process(
 
     with reporting_write_errors(out), TemporaryDirectory(prefix=f".{out.stem}-", dir=out.parent) as folder:
         video = Path(folder).absolute() / out.name  # a simulator may change the current folder of its process
-        items = [(film, seed, video)]
+        items = [(record_here, seed, video)]
         (made,) = map_in_processes(1, draw_unseen, (), partial(_record, is_stopped), items, lose, stall, look)
         video.replace(out)
     return made
@@ -82,7 +73,7 @@ def record_in_process(
 
 def _record(is_stopped: Any, item: tuple[partial[float], int, Path]) -> tuple[float, int]:
     """Record one episode in a child process until the parent stops it; return its score and its steps."""
-    film, seed, out = item
+    record_here, seed, out = item
     steps = 0
 
     def on_step(made: int) -> None:
@@ -91,7 +82,7 @@ def _record(is_stopped: Any, item: tuple[partial[float], int, Path]) -> tuple[fl
         count_step()
 
     try:
-        score = film(seed=seed, out=out, on_step=on_step, stop=lambda: bool(is_stopped.value))
+        score = record_here(seed=seed, out=out, on_step=on_step, stop=lambda: bool(is_stopped.value))
     except (KeyboardInterrupt, SystemExit, GeneratorExit) as error:  # of the simulator: no Ctrl-C raises here
         raise DreamfleetError(f"the episode of seed {seed} failed: {failure_of(error).text}") from error
     return score, steps

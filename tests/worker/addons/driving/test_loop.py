@@ -1,4 +1,4 @@
-"""Tests loop.py, drive_window.py, picture_window.py and scene.py."""
+"""Tests loop.py, drive_window.py and picture_window.py."""
 
 import os
 
@@ -8,10 +8,9 @@ import pytest
 
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import NoDisplayError, UsageError
-from dreamfleet.worker.addons.driving.drive_window import BACKGROUND, DriveStatus, DriveWindow, Pedals
-from dreamfleet.worker.addons.driving.loop import DrivingConfig, drive
+from dreamfleet.worker.addons.driving.drive_window import BACKGROUND, DriveWindow, Pedals
+from dreamfleet.worker.addons.driving.loop import DreamScene, DrivingConfig, drive, make_scene
 from dreamfleet.worker.addons.driving.picture_window import PictureWindow
-from dreamfleet.worker.addons.driving.scene import DreamScene, make_scene
 
 SEED = 20_003
 
@@ -92,7 +91,7 @@ def test_the_dream_is_shown_with_hard_pixels_and_its_score_below():
     with DriveWindow("a dream", (4, 4), 200) as window:
         picture = pygame.Surface((4, 4))
         picture.set_at((1, 0), (255, 0, 0))
-        window.show(picture, DriveStatus(1.5, 2, 10, over=True))
+        window.show(picture, 1.5, 2, 10, over=True)
         shown = pygame.display.get_surface()
         assert shown.get_size() == (800, 864)
         assert shown.get_at((200, 0))[:3] == shown.get_at((399, 199))[:3] == (255, 0, 0)
@@ -105,7 +104,7 @@ def test_the_dream_is_shown_with_hard_pixels_and_its_score_below():
 def test_the_longest_text_fits_the_narrowest_window():
     with DriveWindow("a dream", (64, 64), 1) as window:
         for _ in range(12):  # the clock knows its rate after ten frames
-            window.show(pygame.Surface((64, 64)), DriveStatus(-1234.5, 10_000, 10_000, over=False))
+            window.show(pygame.Surface((64, 64)), -1234.5, 10_000, 10_000, over=False)
         shown = pygame.display.get_surface()
         right = shown.subsurface((shown.get_width() - 12, 64, 12, 64))
         assert pygame.transform.average_color(right)[:3] == BACKGROUND

@@ -12,7 +12,6 @@ from dreamfleet.worker.addons.recording.canvas import (
     MARGIN,
     SIDE,
     Canvas,
-    DreamPicture,
     DriveFrame,
     ModelPictures,
     choice_name,
@@ -28,7 +27,7 @@ def plain(colour):
     return np.full((64, 64, 3), colour, np.uint8)
 
 
-MODELS = ModelPictures(plain(GREEN), plain(BLUE), DreamPicture(plain(WHITE), 0))
+MODELS = ModelPictures(plain(GREEN), plain(BLUE), plain(WHITE), 0)
 
 
 def test_a_frame_shows_the_track_the_observation_and_the_decoded_latent():
@@ -55,7 +54,7 @@ def test_the_end_stands_on_the_top_of_the_worlds_picture_and_leaves_the_rest():
 
 @pytest.mark.parametrize("since", [0, 9900])
 def test_a_dreamt_picture_and_its_label_fit_into_the_frame(since):
-    models = replace(MODELS, dreamt=DreamPicture(plain(WHITE), since))
+    models = replace(MODELS, since=since)
     frame = Canvas(SEED, WORLD).draw(DriveFrame(plain(RED), ACTION, 7, 12.5, models))
     assert frame.shape[1::-1] == DREAMING.size
     column = frame[:, DREAMING.track[0] + 20 :][:, :SIDE]
