@@ -21,35 +21,14 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.user_code import describe_error
 from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.common.schema.validation import OPTIONAL, MalformedError, from_plain, to_plain
+from dreamfleet.worker.tasks import pictures
 from dreamfleet.worker.tasks.api import Assignment, Driver, Policy, Task, World
 from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tasks.drivers import HeldActions, UniformActions
-from dreamfleet.worker.tasks.pictures import (
-    KINDS,
-    Crop,
-    CropAndResize,
-    FrameDifference,
-    LookAtDrawn,
-    Pixels,
-    SkipFrames,
-    VectorActions,
-    cut_and_resize,
-    find_axes,
-    frame_difference,
-    is_picture,
-    parse_crop,
-    tile_frames,
-)
 from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.tasks.registry import preprocessing_for
 from dreamfleet.worker.worldmodel.policy import ModelPolicy
-from dreamfleet.worker.worlds.gym.environments import (
-    RGB,
-    action_meanings,
-    describe_environment,
-    distributions_of,
-    make_environment,
-)
+from dreamfleet.worker.worlds.gym import environments
 from dreamfleet.worker.worlds.gym.spaces import make_converter, vector_actions
 
 RENDERED = "render"  # as an observation: what the environment draws
@@ -104,9 +83,9 @@ class PixelOptions:
         return write_options(to_plain(self))
 
     @property
-    def rows_and_columns(self) -> Crop | None:
+    def rows_and_columns(self) -> pictures.Crop | None:
         """The crop's first row, row after the last, first column and column after the last; `None`: no crop."""
-        return parse_crop(self.crop)
+        return pictures.parse_crop(self.crop)
 
     @property
     def preprocessing(self) -> str:
@@ -148,9 +127,9 @@ class GymPixelTask(Task):
         return self._world
 
     def _describe(self, made: gymnasium.Env[Any, Any], actions: Continuous) -> World:
-        facts = describe_environment(made, self._options.skip)
-        meanings = action_meanings(made)
-        drawing = distributions_of("pygame") if self._options.observation == RENDERED else ()
+        facts = environments.describe_environment(made, self._options.skip)
+        meanings = environments.action_meanings(made)
+        drawing = environments.distributions_of("pygame") if self._options.observation == RENDERED else ()
         packages = tuple(dict.fromkeys((*facts.pop("packages"), "onnxruntime", *drawing)))
         names = meanings if len(meanings) == actions.actions else ()
         return World(actions, packages, action_names=names, **facts)
@@ -160,9 +139,9 @@ class GymPixelTask(Task):
         """One: the pictures of the options; its `picture` takes one alone, in which nothing moves."""
         name, size, crop = self._options.preprocessing, self._options.size, self._options.rows_and_columns
 
-        def picture(seen: NDArray[Any]) -> Pixels:
-            small = cut_and_resize(tile_frames(seen) if self._tiles else seen, size, crop)
-            return frame_difference(small, small) if self._options.difference else small
+        def picture(seen: NDArray[Any]) -> pictures.Pixels:
+            small = pictures.cut_and_resize(pictures.tile_frames(seen) if self._tiles else seen, size, crop)
+            return pictures.frame_difference(small, small) if self._options.difference else small
 
         return {name: Preprocessing(name, size, picture, mirrors=False)}
 
@@ -183,16 +162,12 @@ class GymPixelTask(Task):
             raise UsageError(f"{self.name} gives pictures {', '.join(self.preprocessings)}, not {preprocessing!r}")
         return self._open()
 
-    def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
-        """The same; `BundleError` if the world model is of other pictures."""
-        return self.make_evaluation_environment(assignment)
-
-    def make_evaluation_environment(
-        self, assignment: Assignment, render_mode: str | None = None
-    ) -> gymnasium.Env[Any, Any]:
-        """The same, which also draws in this render mode."""
+    def make_environment(self, assignment: Assignment, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+        """The same, which also draws in this render mode; `BundleError` if the world model is of other pictures."""
         preprocessing_for(assignment.world_model, self)
         return self._open(render_mode)
+
+    make_evaluation_environment = make_environment
 
     def make_policy(self, assignment: Assignment) -> Policy:
         """The policy of the world model; `BundleError` if that is of other pictures."""
@@ -211,50 +186,49 @@ class GymPixelTask(Task):
 
     def _make(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         if self._options.observation == RENDERED:
-            if render_mode not in (None, RGB):
+            if render_mode not in (None, environments.RGB):
                 raise UsageError(f"{self._id} observes what it draws, so it draws nothing else: {render_mode!r}")
-            render_mode = RGB
-        return make_environment(self._id, self._options.environment, render_mode)
+            render_mode = environments.RGB
+        return environments.make_environment(self._id, self._options.environment, render_mode)
 
-    def _wrap(self, made: gymnasium.Env[Any, Any]) -> VectorActions:
+    def _wrap(self, made: gymnasium.Env[Any, Any]) -> pictures.VectorActions:
         options = self._options
-        seen = self._choose_picture(SkipFrames(made, options.skip) if options.skip > 1 else made)
-        pictures: gymnasium.Env[Any, Any] = CropAndResize(seen, options.size, options.rows_and_columns)
+        seen = self._choose_picture(pictures.SkipFrames(made, options.skip) if options.skip > 1 else made)
+        small: gymnasium.Env[Any, Any] = pictures.CropAndResize(seen, options.size, options.rows_and_columns)
         if options.difference:
-            pictures = FrameDifference(pictures)
+            small = pictures.FrameDifference(small)
         actions = vector_actions(made.action_space, self._id)
-        return VectorActions(OneEnd(pictures), actions, make_converter(made.action_space, actions))
+        return pictures.VectorActions(OneEnd(small), actions, make_converter(made.action_space, actions))
 
     def _choose_picture(self, environment: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
         space, wanted = environment.observation_space, self._options.observation
         entries = space.spaces if isinstance(space, spaces.Dict) else {"": space}
-        pictures = [key for key, each in entries.items() if is_picture(each)]
-        only = pictures[0] if len(pictures) == 1 else None
-        every = EVERY_FRAME if only is not None and "N" in find_axes(entries[only].shape or ()) else ""
+        keys = [key for key, each in entries.items() if pictures.is_picture(each)]
+        only = keys[0] if len(keys) == 1 else None
+        every = EVERY_FRAME if only is not None and "N" in pictures.find_axes(entries[only].shape or ()) else ""
         key = only if wanted in ("", every) else wanted
-        if key is not None and key in pictures:
+        if key is not None and key in keys:
             seen = environment
             if isinstance(space, spaces.Dict):
                 seen = TransformObservation(environment, lambda observation: observation[key], entries[key])
             return _tile(seen, entries[key]) if self._tiles else seen
         if wanted == RENDERED:
             try:
-                return LookAtDrawn(environment)
+                return pictures.LookAtDrawn(environment)
             except Exception as error:  # environments may raise anything
                 raise UsageError(f"{self._id} draws no pictures: {describe_error(error)}") from error
-        draws = RGB in environment.metadata.get("render_modes", ())
-        known = [each for each in (*pictures, every) if each] + [RENDERED] * (draws and RENDERED not in pictures)
+        draws = environments.RGB in environment.metadata.get("render_modes", ())
+        known = [each for each in (*keys, every) if each] + [RENDERED] * (draws and RENDERED not in keys)
         remedy = f"choose one with --observation: {', '.join(known)}" if known else "and it draws none"
         raise UsageError(
             f"{self._id} observes {space}, where {repr(wanted) if wanted else 'the picture'} is no picture or not the "
-            f"only one: {remedy}. A picture is {KINDS}"
+            f"only one: {remedy}. A picture is {pictures.KINDS}"
         )
 
 
 def _tile(environment: gymnasium.Env[Any, Any], stack: Any) -> gymnasium.Env[Any, Any]:
-    """The environment with all frames of its stack in one picture."""
-    space = spaces.Box(tile_frames(stack.low), tile_frames(stack.high), dtype=stack.dtype)
-    return TransformObservation(environment, lambda frames: tile_frames(np.asarray(frames)), space)
+    space = spaces.Box(pictures.tile_frames(stack.low), pictures.tile_frames(stack.high), dtype=stack.dtype)
+    return TransformObservation(environment, lambda frames: pictures.tile_frames(np.asarray(frames)), space)
 
 
 @lru_cache(maxsize=64)

@@ -15,14 +15,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import FlattenObservation, TransformAction
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.actions import (
-    MAX_OUTPUTS,
-    Actions,
-    Continuous,
-    Discrete,
-    grouped,
-    one_hot,
-)
+from dreamfleet.common.artifacts.actions import MAX_OUTPUTS, Actions, Continuous, Discrete, grouped, one_hot
 from dreamfleet.common.errors import UsageError
 
 Floats = NDArray[np.float32]

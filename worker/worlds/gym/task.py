@@ -23,17 +23,10 @@ from dreamfleet.common.artifacts.task_options import check_options
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.worker.tasks.api import Assignment, Description, Policy, Task, World
-from dreamfleet.worker.tasks.closing import close_environment
+from dreamfleet.worker.tasks.closing import close_environment, closing_environment
 from dreamfleet.worker.tasks.policy import FlatPolicy
 from dreamfleet.worker.tasks.reset import reset_folded
-from dreamfleet.worker.worlds.gym.environments import (
-    DEFAULT_MAX_STEPS,
-    RGB,
-    action_meanings,
-    describe_environment,
-    is_gymnasiums,
-    make_environment,
-)
+from dreamfleet.worker.worlds.gym import environments
 from dreamfleet.worker.worlds.gym.pixels import GymPixelTask, PixelOptions
 from dreamfleet.worker.worlds.gym.spaces import flatten_environment, is_of_numbers
 
@@ -64,21 +57,20 @@ class GymTask(Task):
         """The world of the environment's spaces and registration; `UsageError` if they cannot be used."""
         return self._facts(*_frozen(assignment)).world
 
-    def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
-        """The environment, with the arguments that the run froze."""
-        return self.make_evaluation_environment(assignment)
+    def make_environment(self, assignment: Assignment, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+        """The environment, with the arguments that the run froze.
 
-    def make_evaluation_environment(
-        self, assignment: Assignment, render_mode: str | None = None
-    ) -> gymnasium.Env[Any, Any]:
-        """The same environment; `UsageError` if it has no render modes and pictures are wanted."""
+        `UsageError` if it has no render modes and pictures are wanted.
+        """
         return self._open(*_frozen(assignment), render_mode)
+
+    make_evaluation_environment = make_environment
 
     def make_watched_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any] | None:
         """The environment with pictures; `None` outside of gymnasium, where `render` might change scores."""
         if not self._facts(*_frozen(assignment)).is_drawn:
             return None
-        return _RenderOnDemand(self.make_evaluation_environment(assignment, RGB))
+        return _RenderOnDemand(self.make_environment(assignment, environments.RGB))
 
     def make_policy(self, assignment: Assignment) -> Policy:
         """A controller on the flat observation, normalised with the statistics that the run froze."""
@@ -103,8 +95,7 @@ class GymTask(Task):
         check_options(f"task {self.name}", options, OPTIONS)
         arguments = dict(options.get("environment") or {})
         keys = list(dict.fromkeys(options.get("observation") or ()))
-        environment = self._open(arguments, keys)
-        try:
+        with closing_environment(self._open(arguments, keys)) as environment:
             world = self._facts(arguments, keys).world
             self._check_version(environment)
             frozen: dict[str, Any] = {"environment": arguments} if arguments else {}
@@ -115,8 +106,6 @@ class GymTask(Task):
                 frozen["normal"] = {"mean": mean.tolist(), "deviation": deviation.tolist()}
             observations = int(np.prod(environment.observation_space.shape or (1,)))
             steps = (environment.spec and environment.spec.max_episode_steps) or 0
-        finally:
-            close_environment(environment)
         text = json.dumps(frozen, sort_keys=True) if frozen else ""
         return Description(observations, world.actions.outputs, world.packages, world.version, text, steps)
 
@@ -138,7 +127,7 @@ class GymTask(Task):
         self, arguments: Mapping[str, Any], keys: Sequence[str] = (), render_mode: str | None = None
     ) -> gymnasium.Env[Any, Any]:
         """The environment for a controller without a world model; its facts are known from then on."""
-        made = make_environment(self._id, arguments, render_mode)
+        made = environments.make_environment(self._id, arguments, render_mode)
         try:
             environment, actions = flatten_environment(made, self._id, keys)
             _known[self._key(arguments, keys)] = _Facts.of(made, actions, keys)
@@ -162,12 +151,12 @@ class _Facts:
     @classmethod
     def of(cls, made: gymnasium.Env[Any, Any], actions: Actions, keys: Sequence[str]) -> _Facts:
         """The facts of an environment before it was wrapped, and of its actions after that."""
-        meanings, space = action_meanings(made), made.action_space
+        meanings, space = environments.action_meanings(made), made.action_space
         names = meanings if len(meanings) == actions.outputs and isinstance(actions, Discrete) else ()
         takes_plain = isinstance(space, spaces.Discrete) or (isinstance(space, spaces.Box) and len(space.shape) == 1)
         return cls(
-            World(actions, action_names=names, **describe_environment(made)),
-            is_gymnasiums(made) and RGB in made.metadata.get("render_modes", ()),
+            World(actions, action_names=names, **environments.describe_environment(made)),
+            environments.is_gymnasiums(made) and environments.RGB in made.metadata.get("render_modes", ()),
             takes_plain and not keys and is_of_numbers(made.observation_space),
         )
 
@@ -193,7 +182,7 @@ class _RenderOnDemand(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def render(self) -> Any:
         """Draw the current picture."""
-        self.unwrapped.render_mode = RGB
+        self.unwrapped.render_mode = environments.RGB
         try:
             return super().render()
         finally:
@@ -209,7 +198,7 @@ def _measure_normalisation(
     for episode in range(NORMALISING_EPISODES):
         observation = reset_folded(environment, seed + episode)
         over, steps = False, 0
-        while not over and steps < DEFAULT_MAX_STEPS:
+        while not over and steps < environments.DEFAULT_MAX_STEPS:
             steps += 1
             seen.append(np.asarray(observation, dtype=np.float64).reshape(-1))
             observation, _, terminated, truncated, _ = environment.step(environment.action_space.sample())

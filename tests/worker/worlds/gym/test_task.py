@@ -17,8 +17,7 @@ from dreamfleet.common.protocol.tasks import describe_task, family_of, load_task
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task, known_tasks
 from dreamfleet.worker.worlds.gym import environments
-from dreamfleet.worker.worlds.gym.environments import ArgumentsError, make_environment
-from dreamfleet.worker.worlds.gym.task import DEFAULT_MAX_STEPS
+from dreamfleet.worker.worlds.gym.environments import DEFAULT_MAX_STEPS, ArgumentsError, make_environment
 from tests.support import tasks
 from tests.support.specs import described_spec
 from tests.support.stuck_environments import MODULE as STUCK
