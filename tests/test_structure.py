@@ -48,7 +48,7 @@ STARTING_CHILDREN = {
 WITHOUT_TEST = {
     "common/errors.py",  # exceptions alone
     # measurements, which people start
-    *(f"worker/addons/bench/{name}.py" for name in ("batches", "dream", "live", "policy", "torch_steps")),
+    *(f"worker/addons/bench/{name}.py" for name in ("batches", "live", "steps", "torch_steps")),
 }
 
 

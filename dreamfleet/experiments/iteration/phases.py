@@ -33,8 +33,7 @@ from dreamfleet.experiments.local.kept_document import write_document
 from dreamfleet.experiments.local.local_run import LocalFleet, coordinator_words, evolve, has_ended
 from dreamfleet.worker.addons.bundles.extract import ExtractRequest, extract_models
 from dreamfleet.worker.addons.inspection.measure import measure
-from dreamfleet.worker.addons.refit.refit_stage import refit_controller
-from dreamfleet.worker.addons.refit.subspace_stage import fit_subspace
+from dreamfleet.worker.addons.refit.stages import fit_subspace, refit_controller
 from dreamfleet.worker.training.stages.bundle import build_bundle
 from dreamfleet.worker.training.stages.collect import CollectReport, collect_drives, import_kept
 from dreamfleet.worker.training.stages.encode import EncodeRequest, encode_drives

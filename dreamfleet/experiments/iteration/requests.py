@@ -17,8 +17,7 @@ from dreamfleet.experiments.iteration.plan import EVOLVE, GATE, MDNRNN, VAE, Pha
 from dreamfleet.experiments.local.command_lines import Words, options
 from dreamfleet.experiments.pipeline import read_bundle, read_training
 from dreamfleet.worker.addons.inspection.measure import FigureName, MeasureRequest
-from dreamfleet.worker.addons.refit.refit_stage import RefitRequest
-from dreamfleet.worker.addons.refit.subspace_stage import SubspaceRequest
+from dreamfleet.worker.addons.refit.stages import RefitRequest, SubspaceRequest
 from dreamfleet.worker.training.stages.bundle import BundleRequest
 from dreamfleet.worker.training.stages.collect import CollectRequest, ImportRequest
 from dreamfleet.worker.training.stages.train import Model, TrainRequest

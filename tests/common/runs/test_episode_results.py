@@ -43,8 +43,8 @@ def test_statistics_weight_episodes_by_their_steps():
     found = scored(1.0).results  # an environment that does not report them
     assert (found.finished, found.speed, found.braking, found.error) == (None, None, None, None)
     for absent in ("laps", "±"):
-        assert absent not in scored(1.0).description
-    assert "above" not in scored(700, 800).description, "a report without laps is not compared with marks"
+        assert absent not in scored(1.0).describe()
+    assert "above" not in scored(700, 800).describe(), "a report without laps is not compared with marks"
 
 
 @pytest.mark.parametrize(
@@ -57,10 +57,10 @@ def test_statistics_weight_episodes_by_their_steps():
     ],
 )
 def test_the_description_says_whether_the_environment_is_solved(mean, count, figures):
-    assert re.search(figures, scored(*[mean] * count, threshold=900.0).description.splitlines()[1])
-    assert "threshold" not in scored(*[mean] * count).description, "where gymnasium names none"
+    assert re.search(figures, scored(*[mean] * count, threshold=900.0).describe().splitlines()[1])
+    assert "threshold" not in scored(*[mean] * count).describe(), "where gymnasium names none"
     failed = scored(*[mean] * count, threshold=mean - 10.0, failed=(BROKEN,))  # on a seed: it is not solved
-    assert re.search(rf"10\.0 .*{mean - 10}", failed.description)
+    assert re.search(rf"10\.0 .*{mean - 10}", failed.describe())
 
 
 def test_a_report_round_trips_with_its_statistics_and_describes_driving_and_origin(tmp_path):
@@ -71,7 +71,7 @@ def test_a_report_round_trips_with_its_statistics_and_describes_driving_and_orig
     assert {"mean", "std", "scores", "seeds", "task", "bundle", "judge"} < plain.keys(), "as ever"
     assert (plain["n"], plain["above_900"], plain["finished"], plain["controller"]) == (3, 1 / 3, 1, "cd" * 32)
     assert plain["drives"][1]["steps"] == 500
-    score, manner, origin = JUDGEMENT.description.splitlines()
+    score, manner, origin = JUDGEMENT.describe().splitlines()
     assert re.search(r"670\.0 ± 210\.7.* 3 .*250\.0.* 910\.0.* 850\.0", score)
     assert re.search(r"800: 67%.* 900: 33%.* 1 of 3.* 60\.0.* 10%", manner)
     assert re.search(f"2,000.* 12.* {'cd' * 6}.* {'ab' * 6}", origin)
@@ -81,7 +81,7 @@ def test_failed_episodes_count_in_no_figure_and_round_trip(tmp_path):
     found = EpisodeResults.of([BROKEN, *DRIVES])
     assert (found.mean, found.seeds, found.failed) == (670.0, (10_000, 10_001, 10_002), (BROKEN,))
     report = replace(JUDGEMENT, failed=(BROKEN,))
-    assert "seed 10007, ValueError: no road" in report.description
+    assert "seed 10007, ValueError: no road" in report.describe()
     (tmp_path / "report.json").write_text(report.to_json())
     assert read_evaluation_report(tmp_path / "report.json") == report
     with pytest.raises(DreamfleetError, match="seed 10007, ValueError: no road"):
@@ -189,7 +189,7 @@ def test_a_report_of_another_world_names_its_judge_and_its_marks(tmp_path):
     plain = json.loads(report.to_json())
     assert (plain["above_750"], plain["marks"]) == (0.5, [750.0])
     assert "above_800" not in plain
-    score, marks, threshold, _ = report.description.splitlines()
+    score, marks, threshold, _ = report.describe().splitlines()
     assert score.endswith("dodge")
     assert "750: 50%" in marks
     assert re.search(r"0\.0 above .*750.* 100 seed", threshold)

@@ -43,9 +43,7 @@ class RandomPolicy:
 
     def __init__(self, random: np.random.Generator, actions: Actions) -> None:
         self._driver = UniformActions(random, one_hot(actions.outputs) if isinstance(actions, Discrete) else actions)
-        self._convert: Callable[[Floats], Any] = (
-            actions.to_action if isinstance(actions, Discrete) else lambda drawn: drawn
-        )
+        self._convert: Callable[[Floats], Any] = actions.to_action if isinstance(actions, Discrete) else np.asarray
 
     def begin(self, parameters: Floats) -> None:
         """Do nothing: it has no memory."""

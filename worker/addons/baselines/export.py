@@ -40,15 +40,8 @@ def export_agent(folder: Path) -> TrainedAgent:
         "versions": {package: package_version(package) for package in ("dreamfleet", "gymnasium", "torch")},
     }  # fmt: skip
     choices = tuple(tuple(map(float, each)) for each in config.table)
-    manifest = AgentManifest(
-        DRQN,
-        FIRST_WORLD,
-        preprocessing_of_size(config.picture).name,
-        choices,
-        config.frame_skip,
-        2 * config.hidden,
-        provenance,
-    )
+    pictures = preprocessing_of_size(config.picture).name
+    manifest = AgentManifest(DRQN, FIRST_WORLD, pictures, choices, config.frame_skip, 2 * config.hidden, provenance)
     return TrainedAgent(manifest, export_network(weights, config))
 
 

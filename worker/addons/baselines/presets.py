@@ -11,7 +11,6 @@ from dreamfleet.common.artifacts.actions import FIVE_CHOICES
 from dreamfleet.common.artifacts.trained_agent import MAX_FRAME_SKIP
 from dreamfleet.common.cli.bounds import NotNegative, Positive, check_bounds
 from dreamfleet.common.cli.config import option
-from dreamfleet.common.cli.presets import check_preset
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.messages import Share
 from dreamfleet.common.schema.validation import Count
@@ -176,8 +175,3 @@ LEARNING = BaselinePreset(
     ),
 )  # fmt: skip
 PRESETS = {preset.name: preset for preset in (LEARNING, NOTEBOOK)}
-
-
-def find_preset(name: str) -> BaselinePreset:
-    """Return the preset `name`; `UsageError` lists those that exist."""
-    return PRESETS[check_preset("baseline", name)]

@@ -18,8 +18,7 @@ from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.locks import folder_lock
 from dreamfleet.common.host.stop_signals import Stop, never_stop
 from dreamfleet.common.runs.seeds import training_seed
-from dreamfleet.worker.addons.baselines.learner import Learner
-from dreamfleet.worker.addons.baselines.network import Networks, QPolicy
+from dreamfleet.worker.addons.baselines.network import Learner, Networks, QPolicy
 from dreamfleet.worker.addons.baselines.presets import CHECKPOINT, AgentConfig, LearningConfig, epsilon_of
 from dreamfleet.worker.addons.baselines.progress import (
     EpisodeRecord,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.command_line import SimpleVerb
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
-from dreamfleet.common.cli.presets import preset_help_text
+from dreamfleet.common.cli.presets import check_preset, preset_help_text
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path
 from dreamfleet.common.host.unseen_drawing import draw_unseen
@@ -48,11 +48,11 @@ def configure_train(parser: argparse.ArgumentParser) -> None:
 
 def train_baseline(args: argparse.Namespace) -> int:
     """Train, with a report every few episodes on stderr, and print the figures."""
-    from dreamfleet.worker.addons.baselines.presets import DRQN, find_preset
+    from dreamfleet.worker.addons.baselines.presets import DRQN, PRESETS
     from dreamfleet.worker.training.config_flags import apply_settings
 
     _check_learns(args.agent, f"`dreamfleet evaluate --controller {args.agent}` judges it")
-    preset = find_preset(args.preset)
+    preset = PRESETS[check_preset("baseline", args.preset)]
     config, layers = apply_settings((preset.learning, preset.agent), TABLE, args)
     draw_unseen()
     from dreamfleet.common.cli.progress import progress_bar

@@ -41,7 +41,10 @@ def bench_dispatch(crowd: int) -> Figures:
     `crowd` is a number of simulated workers for a third run; 0: none.
     """
     figures: Figures = {}
-    with start_run(SLEEP_TASK, CANDIDATES, 1) as run, run.workers("--task", SLEEP_TASK, "--slots", SLOTS):
+    with (
+        start_run(SLEEP_TASK, CANDIDATES, 1) as run,
+        VerbProcess("worker", "--connect", run.endpoint, "--task", SLEEP_TASK, "--slots", SLOTS),
+    ):
         run.finish()
         figures["efficiency_50ms"] = round(ROUNDS * SLEEP_SECONDS / run.generation_seconds(), 4)
     with start_run(NULL_TASK, 64, NULL_JOBS // 64) as run, run.crowd(2, 32):
@@ -100,10 +103,6 @@ class BenchRun:
     def __init__(self, endpoint: str, runs: Path, coordinator: VerbProcess) -> None:
         self.endpoint, self.coordinator = endpoint, coordinator
         self._runs, self._peak_mb = runs, 0.0
-
-    def workers(self, *arguments: object) -> AbstractContextManager[object]:
-        """Start a real worker; the context manager stops it."""
-        return VerbProcess("worker", "--connect", self.endpoint, *arguments)
 
     @contextmanager
     def crowd(self, count: int, slots: int, seconds: float = 0.0) -> Iterator[None]:

@@ -18,17 +18,17 @@ from dreamfleet.worker.worldmodel.inference import open_graph
 
 Floats = NDArray[np.float32]
 Size = tuple[tuple[int, ...], tuple[int, ...]]  # of the left and the right matrix, or of stacks of them
-FLOAT = 1  # ONNX's number of the type
+NEEDED = {"onnxruntime": ("onnxruntime", "onnx")}  # packages; `onnx` writes the graph of a product
 
 
 def product_cases(sizes: Sequence[Size]) -> dict[str, TimedCall]:
-    """Calls that multiply random matrices of these sizes with NumPy, ONNX Runtime and, if installed, torch."""
+    """Calls that multiply random matrices of these sizes with NumPy and, if installed, ONNX Runtime and torch."""
     random = np.random.default_rng(0)
     cases: dict[str, TimedCall] = {}
     for index, size in enumerate(sizes):
         left, right = (random.normal(size=shape).astype(np.float32) for shape in size)
         for library, make in LIBRARIES.items():
-            if find_spec(library):
+            if all(map(find_spec, NEEDED.get(library, (library,)))):
                 cases[_case(index, library)] = make(left, right)
     return cases
 
@@ -72,36 +72,13 @@ def _by_onnxruntime(left: Floats, right: Floats) -> TimedCall:
 LIBRARIES = {"numpy": _by_numpy, "torch": _by_torch, "onnxruntime": _by_onnxruntime}
 
 
-# ---- a graph of one product, written without the package `onnx`, which only training needs ----
-
-
 def product_graph(left: tuple[int, ...], right: Floats) -> bytes:
-    """An ONNX model of `out = left @ right` in protobuf's wire format; the field numbers are onnx.proto's."""
-    out = (*left[:-1], right.shape[-1])
-    node = _field(1, b"left") + _field(1, b"right") + _field(2, b"out") + _field(4, b"MatMul")
-    dims = b"".join(_field(1, size) for size in right.shape)
-    weight = dims + _field(2, FLOAT) + _field(8, b"right") + _field(9, right.tobytes())
-    graph = _field(1, node) + _field(2, b"product") + _field(5, weight)
-    graph += _field(11, _value(b"left", left)) + _field(12, _value(b"out", out))
-    opset = _field(1, b"") + _field(2, 17)
-    return _field(1, 8) + _field(7, graph) + _field(8, opset)
+    """An ONNX model of `out = left @ right`."""
+    from onnx import TensorProto
 
+    from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
 
-def _value(name: bytes, shape: tuple[int, ...]) -> bytes:
-    dimensions = b"".join(_field(1, _field(1, size)) for size in shape)
-    return _field(1, name) + _field(2, _field(1, _field(1, FLOAT) + _field(2, dimensions)))
-
-
-def _field(number: int, value: int | bytes) -> bytes:
-    """Encode a protobuf field: a varint, or length-prefixed bytes."""
-    if isinstance(value, int):
-        return _varint(number << 3) + _varint(value)
-    return _varint(number << 3 | 2) + _varint(len(value)) + value
-
-
-def _varint(value: int) -> bytes:
-    groups = []
-    while value > 127:
-        groups.append(value & 127 | 128)
-        value >>= 7
-    return bytes([*groups, value])
+    graph = GraphBuilder("product")
+    product = graph.node("MatMul", graph.add_input("left", TensorProto.FLOAT, *left[1:]), graph.constant(right))
+    graph.add_output(product, "out", TensorProto.FLOAT, *left[1:-1], right.shape[-1])
+    return graph.build()

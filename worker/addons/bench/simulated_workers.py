@@ -123,7 +123,6 @@ def _handle_and_send(
     inbox: CountingDecoder,
     wait: float,
 ) -> None:
-    """Handle the received job batches, then send the results and heartbeats that are due."""
     try:
         _, sample = events.get(timeout=wait) if wait else events.get_nowait()
         while True:

@@ -7,10 +7,13 @@ import json
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from operator import call
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.cli.output import add_json_flag
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.host.resource_limits import clear_library_settings, pin_thread_pools
 
 if TYPE_CHECKING:
     from dreamfleet.common.artifacts.bundle import Bundle
@@ -54,13 +57,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _measure_policy(args: argparse.Namespace) -> Figures:
-    from dreamfleet.worker.addons.bench.policy import bench_policy
+    from dreamfleet.worker.addons.bench.steps import bench_policy
 
     return measure_on_one_thread(bench_policy, args.bundle)
 
 
 def _measure_dream(args: argparse.Namespace) -> Figures:
-    from dreamfleet.worker.addons.bench.dream import bench_dream
+    from dreamfleet.worker.addons.bench.steps import bench_dream
 
     return measure_on_one_thread(bench_dream, args.bundle)
 
@@ -78,10 +81,8 @@ def _measure_batches(_args: argparse.Namespace) -> Figures:
 
 
 def _measure_live(args: argparse.Namespace) -> Figures:
-    from dreamfleet.common.artifacts.bundle_store import find_bundle
-    from dreamfleet.common.host.resource_limits import pin_thread_pools
-
     pin_thread_pools()
+    from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.worker.addons.bench.live import bench_live
 
     return bench_live(find_bundle(args.bundle))
@@ -116,13 +117,9 @@ def _compare(bundle_name: str) -> Figures:
 def measure_on_one_thread(measure: Callable[..., Figures], bundle_name: str, *more: object) -> Figures:
     """The figures of `measure(bundle, *more)`, called in a child process whose libraries use one thread."""
     from concurrent.futures.process import BrokenProcessPool
-    from functools import partial
-    from operator import call
 
     from dreamfleet.common.artifacts.bundle_store import find_bundle
-    from dreamfleet.common.errors import DreamfleetError
     from dreamfleet.common.host.process_pool import map_in_processes
-    from dreamfleet.common.host.resource_limits import pin_thread_pools
 
     bundle: Bundle = find_bundle(bundle_name)
     _pin_libraries()
@@ -135,8 +132,6 @@ def measure_on_one_thread(measure: Callable[..., Figures], bundle_name: str, *mo
 
 
 def _pin_libraries() -> None:
-    from dreamfleet.common.host.resource_limits import clear_library_settings, pin_thread_pools
-
     clear_library_settings()
     pin_thread_pools()
 

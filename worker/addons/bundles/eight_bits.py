@@ -26,14 +26,8 @@ from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.worker.addons.bundles.unbundle import Models, restore_models
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.training.data.data_folder import explain_write_errors
+from dreamfleet.worker.worldmodel import export
 from dreamfleet.worker.worldmodel.eight_bits import Ranges
-from dreamfleet.worker.worldmodel.export import (
-    export_activations,
-    export_controller,
-    export_dream,
-    export_encoder,
-    export_policy,
-)
 from dreamfleet.worker.worldmodel.inference import Decoder, DreamStep, open_graph
 
 DREAMS, STEPS, EVERY = 32, 250, 10  # dreams, their steps, and the steps from one picture to the next
@@ -58,12 +52,12 @@ def write_eight_bit_bundle(bundle: Bundle, out: Path) -> Bundle:
     ranges = measure_ranges(bundle, models)
     vae, rnn, vae_config, rnn_config = models.vae, models.mdnrnn, models.vae_config, models.mdnrnn_config
     parts = {name: bundle.read(name) for name in bundle.manifest.parts}
-    parts[ENCODER] = export_encoder(vae, vae_config, ranges)
-    parts[DREAM_GRAPH] = export_dream(rnn, rnn_config, ranges)
+    parts[ENCODER] = export.export_encoder(vae, vae_config, ranges)
+    parts[DREAM_GRAPH] = export.export_dream(rnn, rnn_config, ranges)
     if POLICY in parts:
         actions: Any = task_of(bundle).world.actions
-        parts[POLICY] = export_policy(vae, rnn, vae_config, rnn_config, actions, ranges)
-        parts[LINEAR_CONTROLLER] = export_controller(actions, hidden=False, ordered=True)
+        parts[POLICY] = export.export_policy(vae, rnn, vae_config, rnn_config, actions, ranges)
+        parts[LINEAR_CONTROLLER] = export.export_controller(actions, hidden=False, ordered=True)
     manifest = bundle.manifest
     made = replace(
         manifest, name=out.stem, parts={}, provenance=manifest.provenance | {SINGLE_PRECISION: bundle.sha256},
@@ -76,7 +70,7 @@ def write_eight_bit_bundle(bundle: Bundle, out: Path) -> Bundle:
 def measure_ranges(bundle: Bundle, models: Models) -> Ranges:
     """The largest numbers in a world model's own dreams, under random controllers, and a margin."""
     pictures, inputs = _dream(bundle)
-    graph = open_graph(export_activations(models.vae, models.vae_config), threads=1)
+    graph = open_graph(export.export_activations(models.vae, models.vae_config), threads=1)
     real = float(np.abs(parse_array(bundle.read(INITIAL_LATENTS_PART))[:, 0]).max())
     dreamt = float(np.abs(inputs[:, : bundle.manifest.latent]).max())
     if not dreamt <= FARTHEST * max(real, 1.0):  # false for NaN too

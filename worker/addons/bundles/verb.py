@@ -10,12 +10,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path
 from dreamfleet.worker.addons.bundles.extract import ExtractRequest, extract_models
-from dreamfleet.worker.training.stages.bundle import (
-    RECORDED,
-    BundleReport,
-    BundleRequest,
-    build_bundle,
-)
+from dreamfleet.worker.training.stages.bundle import RECORDED, BundleReport, BundleRequest, build_bundle
 
 SUMMARY = (
     "freeze a trained world model into one file that workers fetch by its hash; --extract takes one apart, "

@@ -63,11 +63,6 @@ class EvaluationReport:
             del fields["options"]
         return json.dumps({**summary_figures(self.results, self.marks), **fields}, allow_nan=False)
 
-    @property
-    def description(self) -> str:
-        """A text for display that calls a seed a seed."""
-        return self.describe()
-
     def describe(self, word: str = "seed") -> str:
         """A text for display: the score, figures on driving, the threshold and the controller; `word`: one seed."""
         failures = self.results.failure_text

@@ -42,9 +42,8 @@ def find_driver(
     network: Agent | None = find_network(Path(name)) if find_network else None
     if network is not None:
         return network
-    from dreamfleet.worker.addons.evaluation.agents import (
-        make_agent,  # heavy, and `baseline train --help` reads this module too
-    )
+    # Heavy, and `baseline train --help` reads this module too.
+    from dreamfleet.worker.addons.evaluation.agents import make_agent
 
     controller, beside = find_agent(name, runs_dir)
     return make_agent(controller, find_bundle_of(controller, bundle, beside))

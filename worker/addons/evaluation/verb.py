@@ -115,7 +115,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _choose_agent(args: argparse.Namespace) -> tuple[str, Agent]:
-    """The name and controller to judge: from this disk, or from a live run."""
     from dreamfleet.common.addons.analysis.elites import find_elite
     from dreamfleet.common.client.client import Client
     from dreamfleet.common.runs.lookup import find_bundle_of
@@ -123,9 +122,9 @@ def _choose_agent(args: argparse.Namespace) -> tuple[str, Agent]:
     from dreamfleet.worker.service.bundle_fetch import fetch_bundle_of
 
     live = bool(args.run_name) or bool({"connect", "join"} & args.given)
+    if (args.task or args.environment) and (not args.controller or args.cell is not None):
+        raise UsageError("--task and --environment are the world of --controller random: a run has its own")
     if live and not args.controller:
-        if args.task or args.environment:
-            raise UsageError("--task and --environment are the world of --controller random: a live run has its own")
         with Client(resolve_network(args)) as client:
             run = args.run_name or client.status().run
             reported = client.controller(run)
@@ -135,8 +134,6 @@ def _choose_agent(args: argparse.Namespace) -> tuple[str, Agent]:
     if live or not args.controller:
         raise UsageError("give either --controller, or --run (and --connect) to judge what a live run reports")
     if args.cell is not None:
-        if args.task or args.environment:
-            raise UsageError("--task and --environment are the world of --controller random: a cell's run has its own")
         controller, beside, found = find_elite(args.runs_dir, args.controller, args.cell)
         name = f"{args.controller}, cell {args.cell}"
         print(f"{args.controller}, {found}, as the run measured it", file=sys.stderr)

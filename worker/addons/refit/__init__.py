@@ -1,3 +1,3 @@
 """World models adjusted after their training: subspaces, refits."""
 
-__all__ = ["refit_verb", "refit_stage", "subspace_verb", "subspace_stage"]
+__all__ = ["refit_verb", "subspace_verb", "stages"]

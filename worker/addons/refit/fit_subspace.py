@@ -38,14 +38,8 @@ from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.training.data.drive_steps import FIRST_START, on_road_mask
 
 RIDGE = 0.001  # against the mean square of a feature; see `refit`
-ACTION_WINDOWS = (
-    (0, 3),
-    (3, 8),
-    (8, 15),
-    (15, 22),
-    (22, 30),
-    (30, 40),
-)  # steps from now, of two-sided actions such as steering
+# Steps from now, of two-sided actions such as steering.
+ACTION_WINDOWS = ((0, 3), (3, 8), (8, 15), (15, 22), (22, 30), (30, 40))
 NEXT_WINDOW = (0, 5)  # of other actions
 REWARD_WINDOWS = ((0, 6), (6, 20), (20, 40))
 LEAST_STEPS = 500  # usable steps of all drives, since [z, h] has hundreds of columns
@@ -70,10 +64,15 @@ class SubspaceResult:
 class PredictionTarget:
     """One target: the mean of a column over a window of steps, or its absolute value."""
 
-    name: str
+    quantity: str
     column: int  # of the actions followed by the reward
     window: tuple[int, int]
     size: bool = False  # take the absolute value
+
+    @property
+    def name(self) -> str:
+        """The feature's name: the quantity, and the window."""
+        return f"{self.quantity} {self.window[0]}-{self.window[1]}"
 
     def values(self, sums: Doubles) -> Doubles:
         """Its values at each step `(T,)` of a drive, from the columns' running sums `(T + 1, columns)`.
@@ -91,17 +90,12 @@ def make_targets(world: World, columns: int) -> list[PredictionTarget]:
     actions, found = world.actions, []
     for column in range(columns):
         name = world.action_names[column] if column < len(world.action_names) else f"action {column + 1}"
-        both = (
-            isinstance(actions, Continuous) and not actions.choices and actions.low[column] < 0 < actions.high[column]
-        )
+        plain = isinstance(actions, Continuous) and not actions.choices
+        both = plain and actions.low[column] < 0 < actions.high[column]
         windows = ACTION_WINDOWS if both else (NEXT_WINDOW,)
-        found += [PredictionTarget(_feature_name(name, window), column, window) for window in windows]
-        found += [
-            PredictionTarget(_feature_name(f"|{name}|", window), column, window, size=True)
-            for window in windows
-            if both
-        ]
-    return found + [PredictionTarget(_feature_name("reward", window), columns, window) for window in REWARD_WINDOWS]
+        found += [PredictionTarget(name, column, window) for window in windows]
+        found += [PredictionTarget(f"|{name}|", column, window, size=True) for window in windows if both]
+    return found + [PredictionTarget("reward", columns, window) for window in REWARD_WINDOWS]
 
 
 def find_subspace(
@@ -132,10 +126,9 @@ def find_subspace(
     counted = [0 if each is None else each.steps for each in (fit, held_out)]
     if fit is None or held_out is None or sum(counted) < LEAST_STEPS or not all(counted):
         raise UsageError(
-            f"{plural(len(paths), 'drive')} of {sum(counted)} counted steps are too few: it takes "
-            f"{HELD_OUT_EVERY} drives and "
-            f"{LEAST_STEPS} steps; `dreamfleet collect` drives more. Not counted are the first {FIRST_START} steps of "
-            f"a drive, its last {ACTION_WINDOWS[-1][1]} and those off the road"
+            f"{plural(len(paths), 'drive')} of {sum(counted)} counted steps are too few: it takes {HELD_OUT_EVERY} "
+            f"drives and {LEAST_STEPS} steps; `dreamfleet collect` drives more. Not counted are the first "
+            f"{FIRST_START} steps of a drive, its last {ACTION_WINDOWS[-1][1]} and those off the road"
         )
     r_squared = held_out.r_squared(fit.solve(RIDGE))
     predictable = [index for index, each in enumerate(r_squared) if each >= MIN_R_SQUARED]
@@ -147,9 +140,7 @@ def find_subspace(
     if later.fit and later.held_out:
         ahead, correlated = _canonical_features(later.fit, later.held_out, views)
         solved, scores = np.concatenate([solved, ahead], axis=1), scores + correlated
-        names += [
-            _feature_name(f"view {number}", (VIEW_STEPS, VIEW_STEPS + 1)) for number in range(1, len(correlated) + 1)
-        ]
+        names += [f"view {number} {VIEW_STEPS}-{VIEW_STEPS + 1}" for number in range(1, len(correlated) + 1)]
     return SubspaceResult(_standardise(whole, solved, names, bundle), tuple(scores), len(paths), whole.steps)
 
 
@@ -195,8 +186,7 @@ def _covariances(sums: LeastSquaresSums) -> tuple[Doubles, Doubles, Doubles]:
 def _whitening(spread: Doubles) -> Doubles:
     """The symmetric map that whitens inputs of this covariance, apart from the ridge."""
     scales, axes = np.linalg.eigh(spread + RIDGE * np.eye(len(spread)))
-    found: Doubles = axes / np.sqrt(scales) @ axes.T
-    return found
+    return np.asarray(axes / np.sqrt(scales) @ axes.T)
 
 
 def _standardise(sums: LeastSquaresSums, solved: Doubles, names: Sequence[str], bundle: Bundle) -> Subspace:
@@ -207,7 +197,3 @@ def _standardise(sums: LeastSquaresSums, solved: Doubles, names: Sequence[str], 
     weights, offsets = solved[:-1] / deviation, (solved[-1] - mean) / deviation
     owner = bundle.same_models[-1]  # of a rounded bundle the whole one, so that it fits both
     return Subspace(weights.T.astype(np.float32), offsets.astype(np.float32), tuple(names), owner)
-
-
-def _feature_name(name: str, window: tuple[int, int]) -> str:
-    return f"{name} {window[0]}-{window[1]}"

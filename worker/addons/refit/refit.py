@@ -73,10 +73,8 @@ def refit(
     split = SplitSums()
     for first, drives in load_in_batches(paths, own.manifest.actions):
         latent = old.encode_drives(drives)
-        before, after = (
-            old.features(drives, latent),
-            new.features(drives, latent if same_encoder else new.encode_drives(drives)),
-        )
+        before = old.features(drives, latent)
+        after = new.features(drives, latent if same_encoder else new.encode_drives(drives))
         for row, drive in enumerate(drives):
             on = on_road_mask(drive.reward, lost_after)
             wanted = before[row, : len(on)][on].astype(np.float64) @ weights.T.astype(np.float64) + biases
@@ -85,9 +83,8 @@ def refit(
         on_progress(first + len(drives))
     fit, held_out = split.fit, split.held_out
     if fit is None or not fit.steps:
-        raise UsageError(
-            f"none of the {plural(len(paths), 'drive')} stays on its road: there is nothing to fit a controller to"
-        )
+        few = plural(len(paths), "drive")
+        raise UsageError(f"none of the {few} stays on its road: there is nothing to fit a controller to")
     r_squared = held_out.r_squared(fit.solve(RIDGE)) if held_out and held_out.steps else np.full(len(biases), np.nan)
     whole = fit + held_out if held_out else fit
     solved = whole.solve(RIDGE)
@@ -111,9 +108,8 @@ def output_bounds(controller: Controller, own: Bundle) -> tuple[Doubles, Doubles
         return lowest * np.inf, highest * np.inf
     if controller.shape.hidden or actions.output_indices:
         return lowest, highest
-    for output, (scale, shift, low, high) in enumerate(
-        zip(actions.scale, actions.shift, actions.low, actions.high, strict=True)
-    ):
+    ranges = zip(actions.scale, actions.shift, actions.low, actions.high, strict=True)
+    for output, (scale, shift, low, high) in enumerate(ranges):
         for bound, beyond in ((low, -1), (high, 1)):
             squashed = (bound - shift) / scale
             if abs(squashed) >= 1:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer
-from dreamfleet.worker.addons.refit.refit_stage import DRIVES, RefitRequest, refit_controller
+from dreamfleet.worker.addons.refit.stages import DRIVES, RefitRequest, refit_controller
 
 SUMMARY = "fit a controller to another world model, so that it acts there as before, by regression on recorded drives"
 EXTRAS = ("worker",)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from dreamfleet.common.cli.output import add_json_flag, print_answer
-from dreamfleet.worker.addons.refit.subspace_stage import DRIVES, SubspaceRequest, fit_subspace
+from dreamfleet.worker.addons.refit.stages import DRIVES, SubspaceRequest, fit_subspace
 
 SUMMARY = "find a few features that predict a driver's actions and rewards, for a search among them (--subspace)"
 EXTRAS = ("worker",)

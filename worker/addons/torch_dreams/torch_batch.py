@@ -156,7 +156,6 @@ class _DreamRows:
 
     @torch.no_grad()
     def _advance(self) -> None:
-        """Make a step in place."""
         found = self._step.step(self._latent, self._state, self._take_noise())
         self._latent.copy_(found.latent)
         self._state.copy_(found.state)

@@ -14,6 +14,7 @@ from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.printable import one_line, plural
 
 if TYPE_CHECKING:
+    from dreamfleet.common.protocol.failures import Failure
     from dreamfleet.worker.addons.verification.replay import ReplayedEpisode
 
 SUMMARY = "score a run's candidate again and compare with the journal, bit by bit on a host of the same class"
@@ -56,14 +57,7 @@ def run(args: argparse.Namespace) -> int:
         same = all(each.same for each in episodes)
         fitness = [each.replayed for each in episodes if each.replayed is not None]
         mean = float(np.mean(fitness)) if len(fitness) == len(episodes) else None
-        rows = [
-            {
-                **vars(each),
-                "failure": each.failure.text if each.failure else "",
-                "error": each.error.text if each.error else "",
-            }
-            for each in episodes
-        ]
+        rows = [{**vars(each), "failure": _text(each.failure), "error": _text(each.error)} for each in episodes]
         print(json.dumps({"identical": same, "unchecked": unchecked, "fitness": mean, "stored_fitness": stored_fitness,
                           "episodes": rows}))  # fmt: skip
     else:
@@ -81,6 +75,10 @@ def run(args: argparse.Namespace) -> int:
         print(f"{unchecked} of {count} {'was' if unchecked == 1 else 'were'} scored by hosts of another class, which "
               "this host cannot check bit by bit; --tolerance N compares them", file=sys.stderr)  # fmt: skip
     return 0 if False not in agree and True in agree else 1
+
+
+def _text(failure: Failure | None) -> str:
+    return failure.text if failure else ""
 
 
 def _describe(each: ReplayedEpisode, tolerance: float | None) -> str:

@@ -41,10 +41,8 @@ def run(args: argparse.Namespace) -> int:
 
     if args.jobs < 1 or (args.episodes is not None and args.episodes < 1):
         raise UsageError("--episodes and --jobs must be at least 1")
-    found = [
-        _reproduce(args, path, recorded)
-        for path, recorded in [(each, read_evaluation_report(each)) for each in args.reports]
-    ]
+    recorded = [read_evaluation_report(each) for each in args.reports]
+    found = [_reproduce(args, path, each) for path, each in zip(args.reports, recorded, strict=True)]
     rows = [{"report": path, **_row(each)} for path, each in zip(args.reports, found, strict=True)]
     holds = all(each.is_reproduced for each in found)
     print_answer(args, "\n".join(each.description for each in found), reproduced=holds, reports=rows)
@@ -52,7 +50,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _reproduce(args: argparse.Namespace, path: Path, recorded: EvaluationReport) -> Reproduction:
-    """Drive one report's controller again."""
     from dreamfleet.worker.addons.evaluation.evaluation import judge
     from dreamfleet.worker.addons.verification.reproduction import Reproduction
 

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from dreamfleet.common.errors import DatasetError
-from dreamfleet.worker.addons.baselines.learner import Learner, double_q_target, masked_loss
-from dreamfleet.worker.addons.baselines.network import Networks, duelling
+from dreamfleet.worker.addons.baselines.network import Learner, Networks, double_q_target, duelling, masked_loss
 from dreamfleet.worker.addons.baselines.presets import AgentConfig, LearningConfig, epsilon_of
 from dreamfleet.worker.addons.baselines.replay_buffer import Episode, ReplayBuffer, n_step
 

@@ -1,5 +1,5 @@
 """A subspace of features that predict a driver's actions and rewards.
-Tests subspace_stage.py and subspace_verb.py."""
+Tests subspace_verb.py."""
 
 import json
 

@@ -1,5 +1,5 @@
 """A controller fitted to another world model.
-Tests drive_regression.py, refit_stage.py and refit_verb.py."""
+Tests drive_regression.py, stages.py and refit_verb.py."""
 
 import json
 from dataclasses import replace
