@@ -1,4 +1,4 @@
-"""Tests recording.py, drive_frames.py, video_cli.py and verb.py."""
+"""Tests recording.py, drive_frames.py and verb.py."""
 
 import json
 import re

@@ -224,7 +224,7 @@ def test_an_environment_without_a_time_limit_is_bounded():
 
 def test_a_name_with_a_version_is_taken_although_the_environment_shows_that_of_another(monkeypatch):
     inside = gymnasium.make("CartPole-v1")
-    monkeypatch.setattr("dreamfleet.worker.worlds.gym.task.make_environment", lambda *_: inside)
+    monkeypatch.setattr(environments, "make_environment", lambda *_: inside)
     assert describe_task("gym:MyCart-v0", {}).observations == 4
 
 
