@@ -63,7 +63,7 @@ def test_environment_judge_and_video_score_alike_to_the_bit(bundle, parameters, 
     judge = agent.make_evaluation_environment()
     fitness.append(score(judge, agent.make_policies()(20_000), parameters, EpisodeConfig(20_000, 70)).fitness)
     judge.close()
-    fitness.append(record(agent, 20_000, 70, tmp_path / "drive.mp4"))
+    fitness.append(record(agent, 20_000, 70, tmp_path / "drive.mp4")[0])
     assert fitness == fitness[:1] * 3
 
 

@@ -53,12 +53,10 @@ REASONS = {
     ".h5": "Keras' weights have no reader here, and the article's controllers see a hidden state that knows the new "
     "picture, which no bundle has. Train a world model here on its drives (`dreamfleet import DRIVES --out DATA`)",
     ".pkl": "pickle executes code when it is read: save the numbers with `numpy.save`",
-    ".pickle": "pickle executes code when it is read: save the numbers with `numpy.save`",
     ".pt": "it is not a checkpoint of a program that is known here: save the numbers with "
     "`numpy.save(FILE, tensor.numpy())`",
-    ".pth": "it is not a checkpoint of a program that is known here: save the numbers with "
-    "`numpy.save(FILE, tensor.numpy())`",
 }
+REASONS |= {".pickle": REASONS[".pkl"], ".pth": REASONS[".pt"]}
 KERAS = ("vae/weights.h5", "rnn/weights.h5")  # of the article's program
 
 

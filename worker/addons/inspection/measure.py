@@ -75,7 +75,8 @@ class MeasureReport:
     def facts(self) -> dict[str, Any]:
         """All as values by name, as `inspect --json` prints them."""
         plain = asdict(self)
-        return plain | plain.pop("found")
+        found: dict[str, Any] = plain.pop("found")
+        return plain | found
 
 
 def measure(

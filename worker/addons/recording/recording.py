@@ -23,12 +23,15 @@ from dreamfleet.worker.addons.recording.video import Video
 from dreamfleet.worker.scoring.failure_cause import crash, failure_of
 from dreamfleet.worker.tasks.closing import closing_environment
 
+Recorder = partial[tuple[float, int]]
+"""`record` with its agent, and all that `record_in_process` does not give."""
+
 
 def record(
     agent: Agent, seed: int, steps: int, out: Path, dreaming: ParallelDreamConfig | None = None,
     on_step: Callable[[int], None] = lambda _steps: None, stop: Stop = never_stop,
-) -> float:  # fmt: skip
-    """Record one episode of an agent in its evaluation environment as an mp4; return its score.
+) -> tuple[float, int]:  # fmt: skip
+    """Record one episode of an agent in its evaluation environment as an mp4; return its score and its steps.
 
     With a world model, the video also shows what the model sees, decodes and, if it can, dreams. An episode's end is
     held for a second. If `stop()` turns true, the video ends early, after at least one step.
@@ -42,16 +45,16 @@ def record(
             on_step(moment.step)
             if stop():
                 break
-    return score
+    return score, moment.step
 
 
 def record_in_process(
-    record_here: partial[float], seed: int, out: Path, on_step: Callable[[int], None], stop: Stop,
+    record_here: Recorder, seed: int, out: Path, on_step: Callable[[int], None], stop: Stop,
     stall: float = STALL_SECONDS,
 ) -> tuple[float, int]:  # fmt: skip
     """Record an episode in a child process; return its score and its steps.
 
-    `record_here` is `record` without what is given here. `DreamfleetError` if the episode fails, ends its process, or
+    `DreamfleetError` if the episode fails, ends its process, or
     makes no step for `stall` seconds; then `out` is as it was before. `on_step` is called about once a second.
     """
     is_stopped = get_context("spawn").Value("B", 0, lock=False)
@@ -71,18 +74,10 @@ def record_in_process(
     return made
 
 
-def _record(is_stopped: Any, item: tuple[partial[float], int, Path]) -> tuple[float, int]:
+def _record(is_stopped: Any, item: tuple[Recorder, int, Path]) -> tuple[float, int]:
     """Record one episode in a child process until the parent stops it; return its score and its steps."""
     record_here, seed, out = item
-    steps = 0
-
-    def on_step(made: int) -> None:
-        nonlocal steps
-        steps = made
-        count_step()
-
     try:
-        score = record_here(seed=seed, out=out, on_step=on_step, stop=lambda: bool(is_stopped.value))
+        return record_here(seed=seed, out=out, on_step=count_step, stop=lambda: bool(is_stopped.value))
     except (KeyboardInterrupt, SystemExit, GeneratorExit) as error:  # of the simulator: no Ctrl-C raises here
         raise DreamfleetError(f"the episode of seed {seed} failed: {failure_of(error).text}") from error
-    return score, steps

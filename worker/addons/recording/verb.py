@@ -22,6 +22,7 @@ from dreamfleet.worker.addons.evaluation.verb import CONTROLLER, add_random_flag
 
 if TYPE_CHECKING:
     from dreamfleet.worker.addons.evaluation.agents import Agent
+    from dreamfleet.worker.addons.recording.recording import Recorder
 
 SUMMARY = "record drives as mp4s: the world, what the model sees, what it decodes, what it dreams"
 EXTRAS = ("worker", "views")
@@ -79,11 +80,8 @@ def video_paths(args: argparse.Namespace, default_seed: int) -> dict[int, Path]:
     return videos
 
 
-def _record_videos(args: argparse.Namespace, agent: Agent, record_here: partial[float]) -> None:
-    """Record one video after another and print each score; Ctrl-C ends the current video and the verb.
-
-    `record_here` is as in `record_in_process`.
-    """
+def _record_videos(args: argparse.Namespace, agent: Agent, record_here: Recorder) -> None:
+    """Record one video after another and print each score; Ctrl-C ends the current video and the verb."""
     from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.worker.addons.evaluation.known_score import first_seed
     from dreamfleet.worker.addons.recording.recording import record_in_process

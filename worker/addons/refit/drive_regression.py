@@ -94,21 +94,22 @@ class LeastSquaresSums:
         missed = self.targets[1] - 2 * (solved * self.cross).sum(0) + (solved * (self.inputs @ solved)).sum(0)
         varies = self.targets[1] - self.targets[0] ** 2 / self.steps
         found = np.full_like(varies, np.nan)
-        return np.divide(varies - missed, varies, out=found, where=varies > 1e-9 * self.steps)
+        np.divide(varies - missed, varies, out=found, where=varies > 1e-9 * self.steps)
+        return found
 
 
 class SplitSums:
     """Sums over drives in two parts: `fit`, and `held_out`, every fifth drive, to measure R²."""
 
     def __init__(self) -> None:
-        self.fit: LeastSquaresSums | None = None
-        self.held_out: LeastSquaresSums | None = None
+        self.fit = self.held_out = LeastSquaresSums(0, *np.zeros((3, 1)))
 
     def add(self, number: int, sums: LeastSquaresSums) -> None:
         """Add the sums of drive `number`, counted from 0."""
-        side = "held_out" if number % HELD_OUT_EVERY == HELD_OUT_EVERY - 1 else "fit"
-        so_far = getattr(self, side)
-        setattr(self, side, sums if so_far is None else so_far + sums)
+        if number % HELD_OUT_EVERY == HELD_OUT_EVERY - 1:
+            self.held_out += sums
+        else:
+            self.fit += sums
 
 
 def check_drives(paths: Sequence[Path], bundle: Bundle) -> None:

@@ -90,8 +90,9 @@ def make_targets(world: World, columns: int) -> list[PredictionTarget]:
     actions, found = world.actions, []
     for column in range(columns):
         name = world.action_names[column] if column < len(world.action_names) else f"action {column + 1}"
-        plain = isinstance(actions, Continuous) and not actions.choices
-        both = plain and actions.low[column] < 0 < actions.high[column]
+        both = (
+            isinstance(actions, Continuous) and not actions.choices and actions.low[column] < 0 < actions.high[column]
+        )
         windows = ACTION_WINDOWS if both else (NEXT_WINDOW,)
         found += [PredictionTarget(name, column, window) for window in windows]
         found += [PredictionTarget(f"|{name}|", column, window, size=True) for window in windows if both]
@@ -123,8 +124,8 @@ def find_subspace(
                 later.add(first + row, LeastSquaresSums.of(both, np.zeros((len(both), 0))))
         on_progress(first + len(drives))
     fit, held_out = split.fit, split.held_out
-    counted = [0 if each is None else each.steps for each in (fit, held_out)]
-    if fit is None or held_out is None or sum(counted) < LEAST_STEPS or not all(counted):
+    counted = fit.steps, held_out.steps
+    if sum(counted) < LEAST_STEPS or not all(counted):
         raise UsageError(
             f"{plural(len(paths), 'drive')} of {sum(counted)} counted steps are too few: it takes {HELD_OUT_EVERY} "
             f"drives and {LEAST_STEPS} steps; `dreamfleet collect` drives more. Not counted are the first "
@@ -137,7 +138,7 @@ def find_subspace(
     whole = fit + held_out
     solved, names = whole.solve(RIDGE)[:, predictable], [targets[each].name for each in predictable]
     scores = [float(r_squared[each]) for each in predictable]
-    if later.fit and later.held_out:
+    if later.fit.steps and later.held_out.steps:
         ahead, correlated = _canonical_features(later.fit, later.held_out, views)
         solved, scores = np.concatenate([solved, ahead], axis=1), scores + correlated
         names += [f"view {number} {VIEW_STEPS}-{VIEW_STEPS + 1}" for number in range(1, len(correlated) + 1)]

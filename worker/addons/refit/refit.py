@@ -82,11 +82,11 @@ def refit(
             split.add(first + row, sums)
         on_progress(first + len(drives))
     fit, held_out = split.fit, split.held_out
-    if fit is None or not fit.steps:
+    if not fit.steps:
         few = plural(len(paths), "drive")
         raise UsageError(f"none of the {few} stays on its road: there is nothing to fit a controller to")
-    r_squared = held_out.r_squared(fit.solve(RIDGE)) if held_out and held_out.steps else np.full(len(biases), np.nan)
-    whole = fit + held_out if held_out else fit
+    r_squared = held_out.r_squared(fit.solve(RIDGE)) if held_out.steps else np.full(len(biases), np.nan)
+    whole = fit + held_out
     solved = whole.solve(RIDGE)
     parts = [solved[:-1].T, solved[-1], *(part for layer in above for part in layer)]
     parameters = np.concatenate([part.ravel() for part in parts]).astype(np.float32)

@@ -35,7 +35,7 @@ def agent(random_bundle):
 
 def test_a_video_has_one_frame_a_step_and_the_drives_score(agent, tmp_path):
     steps, out = [], tmp_path / "new" / "drive.mp4"
-    score = record(agent, SEED, STEPS, out, on_step=steps.append)
+    score, _ = record(agent, SEED, STEPS, out, on_step=steps.append)
     judge = agent.make_evaluation_environment()
     driven = episode.score(judge, agent.make_policies()(SEED), agent.parameters, EpisodeConfig(SEED, STEPS))
     judge.close()
@@ -54,7 +54,7 @@ def test_the_end_of_an_episode_is_held_for_a_second_and_named(limit, number, tmp
     arguments = json.dumps({"environment": {"max_episode_steps": limit}})
     falling = Controller(ControllerShape(4, 2), np.zeros(10, np.float32), "gym:CartPole-v1", "", {}, arguments)
     steps = []
-    score = record(make_agent(falling), SEED, 1000, tmp_path / "drive.mp4", on_step=steps.append)
+    score, _ = record(make_agent(falling), SEED, 1000, tmp_path / "drive.mp4", on_step=steps.append)
     assert (len(ends), str(number) in ends[0], score, steps[-1]) == (1, True, number, number)
     shown = pictures(tmp_path / "drive.mp4")
     assert len(shown) == number + 50
