@@ -142,8 +142,10 @@ def _describe_script(contents: CardContents) -> Iterator[str]:
     if contents.difference == 0:
         yield "On the host that wrote this card, its actions and dreamfleet's are bit-identical."
     elif contents.difference is not None:
-        differ = f"Its actions differ from dreamfleet's by about {contents.difference:.1g}"
-        yield f"{differ}: dreamfleet computes such controllers in NumPy."
+        yield (
+            f"Its actions differ from dreamfleet's by about {contents.difference:.1g}: dreamfleet computes such "
+            "controllers in NumPy."
+        )
     yield ""
 
 

@@ -102,8 +102,9 @@ def choose_driver(
         if own is None or controller.bundle != own.sha256:
             own = find_bundle_of(controller, None, beside)
             if own is None:
-                seen = f"controller {controller_name} sees no world model"
-                raise UsageError(f"{seen}: give one that was evolved with one")
+                raise UsageError(
+                    f"controller {controller_name} sees no world model: give one that was evolved with one"
+                )
     bundle = subject.bundle or own
     if bundle is None:
         raise UsageError("give a bundle or a run to measure, or a --controller that has a world model")

@@ -93,7 +93,7 @@ class LeastSquaresSums:
         """R² of each target `(outputs,)` under a solution; NaN for a target that does not vary."""
         missed = self.targets[1] - 2 * (solved * self.cross).sum(0) + (solved * (self.inputs @ solved)).sum(0)
         varies = self.targets[1] - self.targets[0] ** 2 / self.steps
-        found = np.full_like(varies, np.nan)
+        found: Doubles = np.full_like(varies, np.nan)
         np.divide(varies - missed, varies, out=found, where=varies > 1e-9 * self.steps)
         return found
 

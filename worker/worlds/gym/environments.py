@@ -92,8 +92,10 @@ def _make(name: str, arguments: Mapping[str, Any]) -> Environment:
         if known := _known_package(name):
             remedy = "" if find_spec(known[1]) else f"; install its package on this host: `pip install {known[0]}`"
         if colon and isinstance(error, ModuleNotFoundError):
-            remedy = f"; install the package of {module} on this host, or name its folder in PYTHONPATH"
-            remedy += f", and trust it by --trust {module}"
+            remedy = (
+                f"; install the package of {module} on this host, or name its folder in PYTHONPATH, and trust it by "
+                f"--trust {module}"
+            )
         raise UsageError(f"gymnasium makes no environment {name!r} here ({error}){remedy}") from error
     except TypeError as error:
         if _is_of_call(error, arguments):
