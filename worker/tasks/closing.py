@@ -14,7 +14,6 @@ import gymnasium
 from dreamfleet.common.host.foreign_code import contained
 from dreamfleet.common.printable import one_line
 
-Environment = gymnasium.Env[Any, Any]
 log = logging.getLogger(__name__)
 MAX_TEXT = 300  # characters of a fault
 CLOSE_LIMIT = 10.0  # seconds
@@ -37,7 +36,7 @@ class _Hung(BaseException):  # not an Exception, which an environment may catch
     """Interrupts a `close` that hangs."""
 
 
-def close_environment(environment: Environment) -> str:
+def close_environment(environment: gymnasium.Env[Any, Any]) -> str:
     """Close an environment; what its `close` raises is logged as a warning and returned, empty if it raises nothing.
 
     It is interrupted after `CLOSE_LIMIT` seconds, unless native code hangs or this is not the main thread. Other
@@ -64,7 +63,7 @@ def close_environment(environment: Environment) -> str:
 
 
 @contextmanager
-def closing_environment(environment: Environment) -> Iterator[Environment]:
+def closing_environment(environment: gymnasium.Env[Any, Any]) -> Iterator[gymnasium.Env[Any, Any]]:
     """The environment, which is closed by `close_environment` when the `with` ends."""
     try:
         yield environment

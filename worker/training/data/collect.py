@@ -26,7 +26,7 @@ from dreamfleet.worker.scoring.failure_cause import crash, failure_of
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, Rollout, write_episode
 from dreamfleet.worker.scoring.scorer import DRIVER_NAME
 from dreamfleet.worker.tasks.api import Policy
-from dreamfleet.worker.tasks.closing import close_environment
+from dreamfleet.worker.tasks.closing import close_environment, closing_environment
 from dreamfleet.worker.tasks.policy import ALL_DRIVERS, DriverPolicy
 from dreamfleet.worker.tasks.recordable import RecordableTask, TaskWithBeginnings
 from dreamfleet.worker.training.data import dataset
@@ -92,14 +92,9 @@ def _collect_one(folder: Path, config: CollectConfig, pilots: Sequence[Pilot], w
     return len(arrays["action"])
 
 
-@contextmanager
-def fresh_environment(task: RecordableTask, preprocessing: str) -> Iterator[Environment]:
+def fresh_environment(task: RecordableTask, preprocessing: str) -> AbstractContextManager[Environment]:
     """An environment for one drive."""
-    environment = task.make_recorded(preprocessing)
-    try:
-        yield environment
-    finally:
-        close_environment(environment)  # a game of its own process would go on
+    return closing_environment(task.make_recorded(preprocessing))  # a game of its own process would go on
 
 
 @contextmanager
