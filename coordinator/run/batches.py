@@ -52,7 +52,7 @@ class Batches:
     """Takes, reads and cancels the batches of a `run` named `name`."""
 
     def __init__(self, run: Run, name: str) -> None:
-        self._run = run
+        self.run = run
         self._journal = run.journal
         self._name = name
         self._uploads = UploadAssembler()
@@ -65,7 +65,7 @@ class Batches:
 
         R29: while the journal cannot be written, nothing is taken, and the reply says what is durable.
         """
-        stalled = self._run.state.stalled
+        stalled = self.run.state.stalled
         verbs: dict[str, Callable[[], BatchReply]] = {
             "submit": lambda: self._submit(BatchHeader.from_parameters(get), read_count(get, "offset"), payload, now),
             "read": lambda: self._describe(self._find(get), read_count(get, "offset")),
@@ -73,10 +73,10 @@ class Batches:
             "list": lambda: replace(self._head(), batches=tuple(self._journal.batches.lines(MAX_LISTED))),
         }
         try:
-            if not self._run.settings.is_external:
+            if not self.run.settings.is_external:
                 raise BatchError(
                     "not external",
-                    f"run {self._name} has a search of its own ({self._run.settings.optimiser}): submit to one that "
+                    f"run {self._name} has a search of its own ({self.run.settings.optimiser}): submit to one that "
                     "was started with --optimiser external",
                 )
             if verb not in verbs:
@@ -90,13 +90,8 @@ class Batches:
         except NotWritableNowError as error:
             if stalled is not None:
                 raise
-            self._run.wait_until_writable(error)
+            self.run.wait_until_writable(error)
             return self.answer(verb, get, payload, now)
-
-    @property
-    def is_durable(self) -> bool:
-        """Whether an answer waits for no commit."""
-        return self._run.state.stalled is not None
 
     def tick(self, now: float) -> None:
         """Forget uploads without progress: their senders begin again."""
@@ -104,12 +99,12 @@ class Batches:
 
     def take_events(self, closed: Iterable[int], *, progress: bool) -> list[BatchEvent]:
         """An event for each closed generation, and with `progress` one for the open batch if it has new scores."""
-        if not self._run.settings.is_external:
+        if not self.run.settings.is_external:
             return []
         self._durable = None
         found = [batch for number in closed if (batch := self._journal.batches.of(number)) is not None]
         events = [self._event(batch, batch.population) for batch in found]
-        generation = self._run.generation
+        generation = self.run.generation
         batch = self._journal.batches.of(generation.number) if progress and generation.population else None
         if batch is not None:
             *_, done = self._page(batch, 0)
@@ -119,7 +114,7 @@ class Batches:
         return events
 
     def _event(self, batch: StoredBatch, done: int) -> BatchEvent:
-        return BatchEvent(v=keys.PROTOCOL_VERSION, run=self._name, incarnation=self._run.incarnation, id=batch.id,
+        return BatchEvent(v=keys.PROTOCOL_VERSION, run=self._name, incarnation=self.run.incarnation, id=batch.id,
                           state=batch.state, done=done, population=batch.population)  # fmt: skip
 
     def _find(self, get: Parameters) -> StoredBatch:
@@ -151,7 +146,7 @@ class Batches:
 
     def _check(self, header: BatchHeader) -> None:
         """R31: what waits is bounded, and a refused batch leaves its id free."""
-        size = self._run.settings.controller.size
+        size = self.run.settings.controller.size
         if header.size != size:
             raise BatchError(
                 "malformed",
@@ -163,7 +158,7 @@ class Batches:
             raise BatchError("busy", f"{plural(count, 'batch', 'batches')} wait already: submit it again later")
 
     def _episodes(self, header: BatchHeader) -> int:
-        return header.seeds or header.episodes or self._run.settings.episodes
+        return header.seeds or header.episodes or self.run.settings.episodes
 
     def _assemble(self, header: BatchHeader, offset: int, data: bytes, now: float) -> bytes | None:
         """The whole body, once all its parts are here."""
@@ -174,7 +169,7 @@ class Batches:
                 f"a part begins at a multiple of {MAX_PART} and has {MAX_PART} bytes, or those that are left",
             )
         before = self._uploads.dropped.copy()
-        part = UploadPart(run_uid=self._run.uid, incarnation=self._run.incarnation, digest=key, sha256=sha256,
+        part = UploadPart(run_uid=self.run.uid, incarnation=self.run.incarnation, digest=key, sha256=sha256,
                           offset=offset, total=header.total, data=data)  # fmt: skip
         self._uploads.add(header.id, part, now)
         body = self._uploads.get_complete(header.id, key, sha256)
@@ -191,7 +186,7 @@ class Batches:
         seeds: Sequence[int] = unpack_seeds(header, body)
         check_vectors(vectors, header.size)
         if not seeds:
-            first, number = self._run.settings.seed, self._journal.batches.count()
+            first, number = self.run.settings.seed, self._journal.batches.count()
             seeds = [training_seed(first, number, each) for each in range(self._episodes(header))]
         if (remark := remark_on_seeds(seeds)) and not self._remarked:
             self._remarked = True
@@ -206,8 +201,8 @@ class Batches:
         if batch.state not in FINAL:
             self._journal.batches.cancel(batch.id)
             if batch.generation is not None:
-                self._run.generation.cancel()
-                self._run.fleet.leases.withdraw(self._run.generation.unwanted)
+                self.run.generation.cancel()
+                self.run.fleet.leases.withdraw(self.run.generation.unwanted)
         return self._describe(self._journal.batches.find(batch.id) or batch, 0)
 
     def _describe(self, batch: StoredBatch, offset: int) -> BatchReply:
@@ -219,7 +214,7 @@ class Batches:
 
     def _page(self, batch: StoredBatch, offset: int) -> tuple[list[float | None], dict[int, str], int]:
         """Fitness from `offset` on, why some candidates have none, and how many candidates are done."""
-        generations, generation = self._run.generations, self._open_generation
+        generations, generation = self.run.generations, self._open_generation
         limit = min(PAGE_CANDIDATES, max(batch.population - offset, 0))
         if batch.generation is None:
             if batch.state != "cancelled":
@@ -242,15 +237,15 @@ class Batches:
     @property
     def _open_generation(self) -> Generation | None:
         """The open generation: while the journal cannot be written, as it is there, where there may be none."""
-        if self._run.state.stalled is None:
-            return self._run.generation
+        if self.run.state.stalled is None:
+            return self.run.generation
         stored = None if self._durable else self._journal.last_generation()
         if stored is not None and not self._journal.is_closed(stored.number):
-            self._durable = self._run.generations.reload(stored.number)
+            self._durable = self.run.generations.reload(stored.number)
         return self._durable
 
     def _head(self) -> BatchReply:
-        run = self._run
+        run = self.run
         shown = shown_state(run)
         return BatchReply(v=keys.PROTOCOL_VERSION, run=self._name, size=run.settings.controller.size,
                           run_state=shown.word, run_why=truncate(shown.why, 1000))  # fmt: skip

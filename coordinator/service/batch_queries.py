@@ -35,7 +35,7 @@ class BatchQueries:
         payload = query.payload.to_bytes() if query.payload is not None else b""
         reply = self._batches.answer(verb if key == keys.batch(self._name, verb) else key, query.parameters.get,
                                      payload, now)  # fmt: skip
-        if self._batches.is_durable:
+        if self._batches.run.state.stalled:
             _reply(query, reply)
         else:
             self._replies.append((query, reply))

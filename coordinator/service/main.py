@@ -59,6 +59,7 @@ class RunRequest:
     join: Path | None = None  # the file of the credentials
     access_dir: Path = GlobalConfig.access_dir  # holds the list of revoked certificates
     trust: tuple[str, ...] = ()  # modules that must be trusted again when the run is resumed
+    again: str = ""  # the command that continues it, of a verb that does more than resume it
 
     @property
     def folder(self) -> Path:
@@ -84,6 +85,8 @@ class RunRequest:
 
     def resume_command(self, folder: Path | None = None) -> str:
         """The command that continues the run, also in a `folder` that it was moved to."""
+        if self.again and (folder or self.folder).absolute() == self.folder.absolute():
+            return self.again
         access_dir = self.access_dir if self._has_access_dir else None
         return resume_command(folder or self.folder, self.join, access_dir, self.trust)
 

@@ -3,6 +3,8 @@ Tests dreamfleet/experiments/verbs/verify_run.py."""
 
 import json
 import os
+import shlex
+import signal
 import subprocess
 import sys
 
@@ -50,13 +52,16 @@ def first(processes, small, random_bundle, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_run_is_repeated_to_the_bit_through_a_kill(processes, first, random_bundle):
+def test_a_run_is_repeated_to_the_bit_through_a_stop_that_says_how_to_go_on(processes, first, random_bundle):
     words = ("verify", "run", first, "--bundle", random_bundle.path, "--runs-dir", processes.runs, "--listen",
              processes.endpoint, "--beat", 0.2, "--json")  # fmt: skip
     again = processes.start(*words)
     processes.worker("--task", tasks.TOY, "--run", "kept-again")
     again.wait_for_event("generation", number=1)
-    again.end()
+    again.popen.send_signal(signal.SIGINT)
+    code, out = again.finish()
+    assert code == 130
+    assert shlex.split(json.loads(out)["continue"])[-len(words) :] == [*map(str, words)]
     again = processes.start(*words)
     code, out = again.finish()
     answer = json.loads(out)

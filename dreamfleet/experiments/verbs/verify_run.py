@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from dreamfleet.common.cli.config import add_flags
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag
+from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.coordinator.settings.network import NetworkConfig
@@ -49,6 +51,7 @@ def run(args: argparse.Namespace) -> int:
     print(f"note: workers score run {folder.name} as they scored the first; start some on this host or others: "
           f"dreamfleet worker --run {folder.name} {task}".rstrip(), file=sys.stderr)  # fmt: skip
     request = build_request(args, folder.name, config, again.limits, kept, again.start if config else None)
+    request = replace(request, again=shell_command(*args.typed))
 
     def on_ended() -> ExitReport:
         found = again.compare(folder)
