@@ -9,13 +9,7 @@ from msgspec.structs import replace
 
 from dreamfleet.common.protocol.messages import MAX_SLOTS, Result
 from dreamfleet.coordinator.dispatch.event_log import latest
-from dreamfleet.coordinator.dispatch.fleet import (
-    DEPARTURE_GRACE,
-    FORGET_AFTER,
-    GUEST_TIMEOUT,
-    MAX_GUESTS,
-    SILENT_AFTER,
-)
+from dreamfleet.coordinator.dispatch.fleet import DEPARTURE_GRACE, FORGET_AFTER, GUEST_TIMEOUT, MAX_GUESTS, SILENT_AFTER
 from dreamfleet.coordinator.dispatch.member import DEPARTED_TIMEOUT, MAX_DEPARTED
 from dreamfleet.coordinator.dispatch.speculative_execution import LONGEST_HELD, LONGEST_HELD_TIMES, UPLOAD_SECONDS
 from dreamfleet.coordinator.jobs.work import make_work, vector_bytes
@@ -237,17 +231,6 @@ def test_an_unconfirmed_batch_is_sent_again_under_its_number():
     assert again is first
     fleet.handle_heartbeat(A, beat(seen=1, running=digests([first], A)), 3.0)
     assert numbered(fleet.dispatch(9.0)) == []
-
-
-def test_an_error_is_no_fitness_and_another_worker_tries():
-    fleet = fleet_of(A, B, jobs=1)
-    (digest,) = digests(fleet.dispatch(0.0), A)
-    assert fleet.handle_result(A, result(digest, error=failure("boom")), 0.1) == ("refused", None)
-    assert digests(fleet.dispatch(0.1), B) == [digest]
-    assert fleet.failure_judge.find_pausing() is None
-    fleet.handle_result(B, result(digest, error=failure("boom")), 0.2)
-    errors = fleet.failure_judge.find_pausing().errors
-    assert errors == {A: "boom", B: "boom"}
 
 
 @pytest.mark.parametrize(

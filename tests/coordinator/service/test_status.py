@@ -1,5 +1,5 @@
 """Snapshots of a run and the answers that are cut from them, without a transport.
-Tests snapshot.py and coordinator/jobs/history.py."""
+Tests service.py, snapshot.py and coordinator/jobs/history.py."""
 
 import dataclasses
 import json
@@ -22,6 +22,7 @@ from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.run.run import BY_HAND
 from dreamfleet.coordinator.run.run_state import Pause
 from dreamfleet.coordinator.service.run_log import RunLog
+from dreamfleet.coordinator.service.service import next_commit
 from dreamfleet.coordinator.service.snapshot import Snapshot
 from dreamfleet.coordinator.service.status import encode_part, encode_status
 from tests.support.run_bench import A, Bench
@@ -232,3 +233,8 @@ def test_generations_of_one_fitness_are_counted_and_warned_of_once(make_bench, c
     assert not read_status(answered(snapshot_of(bench))).equal_fitness
     score(bench, 8, lambda job: 500.0)
     assert snapshot_of(bench).status.has_risen
+
+
+@pytest.mark.parametrize(("took", "waits"), [(0.0, 0.005), (0.001, 0.005), (0.05, 0.05), (0.3, 0.2), (3600.0, 0.2)])
+def test_a_commit_waits_as_long_as_the_last_one_took_and_never_long(took, waits):
+    assert next_commit(100.0, 100.0 + took) == pytest.approx(100.0 + took + waits)

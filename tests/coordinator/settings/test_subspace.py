@@ -103,13 +103,12 @@ def test_a_schedule_leaves_it_once(settings, stages, number):
         settings(stages=stages)
 
 
-def test_without_one_there_is_nothing_to_leave(random_bundle):
+def test_nothing_to_leave_is_refused_and_a_subspace_of_another_world_model_or_of_other_eyes(
+    random_bundle,
+):
     stages = (StageSettings(generations=2), StageSettings(whole=True, sigma0=0.1))
     with pytest.raises(UsageError, match=r"2.*--subspace"):
         freeze(RunConfig(stages=stages), random_bundle)
-
-
-def test_one_of_another_world_model_or_of_other_eyes_is_refused(random_bundle):
     features = random_bundle.controller_shape.features
     with pytest.raises(UsageError, match=r"--subspace .*abababababab"):
         freeze(RunConfig(loaded_subspace=few(features)), random_bundle)

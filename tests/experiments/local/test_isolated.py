@@ -104,14 +104,11 @@ def test_another_failure_names_the_log(tmp_path, function, code):
     assert {function.__name__, code, str(tmp_path / "log")} <= set(str(raised.value).replace(":", "").split(" "))
 
 
-def test_one_that_is_stopped_says_what_is_kept(tmp_path):
+def test_one_that_is_stopped_says_what_is_kept_or_counts_if_it_finished_all_the_same(tmp_path):
     stop, on_line = stopped_once_begun()
     with pytest.raises(StoppedError) as raised:
         run_isolated(heed, Asked(""), tmp_path / "log", stop, on_line)
     assert raised.value.args == ("7 of 9 are kept",)
-
-
-def test_what_is_finished_all_the_same_counts(tmp_path):
     stop, on_line = stopped_once_begun()
     assert run_isolated(finish_anyway, Asked("done"), tmp_path / "log", stop, on_line) == "done"
 

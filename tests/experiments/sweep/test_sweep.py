@@ -81,12 +81,9 @@ def test_a_value_that_coordinator_refuses_is_refused_before_anything_starts(vary
         check_runs(sweep_of(*vary, flags=flags), SOURCES)
 
 
-def test_the_tasks_of_all_runs_are_announced():
+def test_the_tasks_of_all_runs_are_announced_and_by_a_worker_all_that_its_flags_name():
     sweep = sweep_of("task=gym:CartPole-v1,gym:Acrobot-v1", flags=FLAGS[1:])
     assert check_runs(sweep, SOURCES) == ("gym:CartPole-v1", "gym:Acrobot-v1")
-
-
-def test_a_worker_announces_all_tasks_that_its_flags_name():
     parsed = build_parser("worker", worker).parse_all(task_flags("dream", "gym:mine:Own-v0", "mine:Task"))
     assert parsed.task == ["gym:mine:Own-v0", "mine:Task"]
 

@@ -1,5 +1,6 @@
 """The routes of the page and their access control. Tests assets.py, guard.py, coordinator/addons/web/documents.py,
-coordinator/addons/web/guard.py and coordinator/addons/web/server.py."""
+coordinator/addons/web/address.py, coordinator/addons/web/guard.py and coordinator/addons/web/server.py.
+Tests coordinator/addons/dashboard/config.py."""
 
 import asyncio
 import json
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
+from dreamfleet.common.errors import UsageError
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.addons.dashboard import stored_runs
 from dreamfleet.coordinator.addons.dashboard.app import _Handlers, make_app
@@ -25,6 +27,7 @@ from tests.support.processes import DEADLINE
 
 HOME = "http://127.0.0.1:8420"
 TOKEN = "correct horse battery"
+REACHABLE = ("0.0.0.0", "::", "192.168.1.5", "example.org", "")
 PATHS = (
     "/", "/runs", "/runs/dream", "/hosts/dream", "/compare/dream/reality", "/live", "/view?run=night", "/metrics",
     "/files/0/main.js",
@@ -49,8 +52,10 @@ def guarded(runs):
     return client_of(runs, "0.0.0.0", "http://night.example:8420", token=TOKEN)
 
 
-def test_the_pages_files_load_and_may_be_cached_for_ever(client):
+def test_the_pages_files_load_and_may_be_cached_for_ever_and_it_has_no_script_of_its_own_and_no_other_hosts(client):
     page = client.get("/")
+    assert "http" not in page.text
+    assert not re.search(r"<script(?![^>]*\bsrc=)|\son\w+=|style=", page.text)
     assert page.headers["cache-control"] == "no-store"
     found = re.findall(r'(?:src|href)="(files/[^"]+)"', page.text)
     assert {Path(each).name for each in found} == {"icon.svg", "style.css", "theme.js", "plotly.min.js", "main.js"}
@@ -65,28 +70,9 @@ def test_the_pages_files_load_and_may_be_cached_for_ever(client):
         assert client.get(f"/{folder}/{name}").status_code == 200
 
 
-def test_the_page_holds_no_script_of_its_own_and_names_no_other_host(client):
-    answer = client.get("/")
-    assert "http" not in answer.text
-    assert not re.search(r"<script(?![^>]*\bsrc=)|\son\w+=|style=", answer.text)
-    policy = answer.headers["content-security-policy"]
-    assert "script-src 'self';" in policy
-    assert "default-src 'none'" in policy
-
-
-@pytest.mark.parametrize(
-    "path",
-    [
-        "/files/0/main.js",
-        "/files/x/../../past.py",
-        "/nothing",
-        "/runs/nothing",
-        "/hosts/nothing",
-        "/compare/reality/no",
-    ],
-)
-def test_what_is_not_there_is_404(client, path):
-    assert client.get(path).status_code == 404
+def test_what_is_not_there_is_404(client):
+    for path in ("files/0/main.js", "files/x/../../past.py", "no", "runs/no", "hosts/no", "compare/reality/no"):
+        assert client.get(f"/{path}").status_code == 404, path
 
 
 def test_past_runs_are_listed_with_what_is_wrong_with_them(runs):
@@ -173,10 +159,12 @@ def test_only_get_is_allowed(client, method):
 @pytest.mark.parametrize(
     "host", ["evil.example", "evil.example:8420", "127.0.0.1.evil.example", "localhost.evil.example", ""]
 )
-def test_a_foreign_host_name_that_resolves_here_is_refused(client, host):
+def test_a_foreign_host_name_that_resolves_here_is_refused_and_own_ones_are_answered(client, host):
     for path in PATHS:
         answer = client.get(path, headers={"host": host})
         assert (answer.status_code, "127.0.0.1" in answer.text) == (421, True), path
+    for own in ("localhost:8420", "127.0.0.1", "[::1]:8420", "LOCALHOST"):
+        assert client.get("/", headers={"host": own}).status_code == 200
 
 
 @pytest.mark.parametrize("site", ["cross-site", "same-site"])
@@ -199,11 +187,6 @@ def test_head_of_an_endless_stream_gets_headers_only(client, path):
 def test_what_cannot_be_watched_is_refused_in_words(client, asked):
     answer = client.get(f"/view?{asked}")
     assert (answer.status_code, answer.text.count("\n")) == (400, 1)
-
-
-@pytest.mark.parametrize("host", ["localhost:8420", "127.0.0.1", "[::1]:8420", "LOCALHOST"])
-def test_own_names_are_answered(client, host):
-    assert client.get("/", headers={"host": host}).status_code == 200
 
 
 def test_without_the_token_there_is_a_page_that_asks_for_it(guarded):
@@ -235,7 +218,8 @@ def test_no_redirect_leads_elsewhere(guarded, path):
 def test_every_answer_has_the_security_headers(client, path):
     headers = client.get(path).headers
     assert headers["x-content-type-options"] == "nosniff"
-    assert "frame-ancestors 'none'" in headers["content-security-policy"]
+    policy = headers["content-security-policy"]
+    assert all(each in policy for each in ("frame-ancestors 'none'", "script-src 'self';", "default-src 'none'"))
     assert headers["cross-origin-resource-policy"] == "same-origin"
 
 
@@ -279,3 +263,27 @@ def test_concurrent_requests_share_one_read_of_the_list(runs, monkeypatch):
 
     assert [json.loads(each.body)["runs"] for each in asyncio.run(ask())] == [[]] * 5
     assert len(read) == 1
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.7", "localhost", "::1", *REACHABLE])
+def test_only_a_loopback_address_needs_no_token(host):
+    config = DashboardConfig(host=host, token=TOKEN if host in REACHABLE else None)
+    assert config.is_loopback == (host not in REACHABLE)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        *(({"host": host}, "--token") for host in REACHABLE),
+        ({"token": "short"}, r"--token.*\b12\b"), ({"port": -1}, "--port"), ({"port": 65536}, "--port"),
+    ],
+)  # fmt: skip
+def test_what_is_no_address_or_token_or_lacks_one_is_refused(changes, named):
+    with pytest.raises(UsageError, match=named):
+        DashboardConfig(**changes)
+
+
+def test_an_address_can_be_opened_and_its_repr_hides_the_token():
+    assert TOKEN not in repr(DashboardConfig(token=TOKEN))
+    assert DashboardConfig().url(8420) == "http://127.0.0.1:8420"
+    assert DashboardConfig(host="::1").url(1) == "http://[::1]:1"

@@ -43,15 +43,12 @@ def test_columns_are_equally_long_and_the_band_says_what_it_is():
     assert (drawn["low"][3], drawn["high"][3]) == (2.0, 5.0)
 
 
-def test_only_a_dream_has_two_axes():
+def test_only_a_dream_has_two_axes_an_empty_chart_says_what_will_come_and_a_world_names_its_episodes():
     plain = curves(data(3), None)
     assert (plain["dreamt"], "1,000" in plain["fitness_axis"]) == (False, True)
     task = replace(STATUS.settings.task, task="dream", temperature=1.5)
     dream = curves(data(3, settings=replace(STATUS.settings, task=task)), None)
     assert (dream["dreamt"], "1,000" in dream["fitness_axis"], "16 seeds" in dream["score_axis"]) == (True, True, True)
-
-
-def test_an_empty_chart_says_what_will_come_and_a_world_names_its_episodes():
     drawn = curves(data(0), None, word="track")
     assert drawn["coming"]
     assert "16 tracks" in drawn["score_axis"]

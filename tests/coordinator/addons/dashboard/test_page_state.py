@@ -50,19 +50,13 @@ def test_a_lost_run_with_its_journal_here_shows_the_whole_command():
     assert re.search(f"--resume {STATUS.run}.*--runs-dir.*--join", shown(101.0)["sentence"])
 
 
-def test_generations_of_one_fitness_are_a_trouble():
+def test_troubles_are_failures_generations_of_one_fitness_and_a_worker_that_is_refused_as_long_as_the_run_goes_on():
     assert len(shown(failures=(), equal=ENOUGH)["troubles"]) == 1
     assert shown(failures=(), equal=ENOUGH - 1)["troubles"] == []
-
-
-def test_a_refused_worker_is_told_as_long_as_the_run_goes_on():
     refused = {"vm": "no gymnasium"}
     (trouble,) = shown(refused=refused, failures=())["troubles"]
     assert re.search("vm.*no gymnasium", trouble)
     assert shown(refused=refused, failures=(), state="ended")["troubles"] == []
-
-
-def test_failures_and_failed_episodes_are_named():
     failure = FailureStatus("4/0", "evaluate", (20003,), {"host-a": "no road"}, {"host-a": 2})
     document = shown(failures=(failure,), best=replace(STATUS.best, failed=1))
     (trouble,) = document["troubles"]
@@ -85,13 +79,10 @@ def test_redundant_work_is_one_line_unless_it_is_not_zero():
     assert some["rows"][1][0].endswith("bad\\x1b")
 
 
-def test_the_score_before_the_first_evaluation_says_when_it_comes():
+def test_the_score_before_the_first_evaluation_says_when_it_comes_and_then_its_episodes_as_the_world_calls_them():
     settings = replace(STATUS.settings, evaluate_every=10)
     score = tiles_of(shown(best=None, confirmed=None, settings=settings))["score"]
     assert (score["value"], score["beneath"].split()[-1]) == ("-", "9")
-
-
-def test_episodes_of_a_mean_are_called_as_its_world_calls_them():
     document = shown(word="track", evaluating=EpisodeProgress(3, 16))
     assert "16 tracks" in document["evaluation"][0]
     assert "16 tracks" in tiles_of(document)["score"]["beneath"]

@@ -1,7 +1,11 @@
-"""Prometheus's own parser on the exposition of a status."""
+"""Prometheus's own parser on the exposition of a status; slow clients, and how long an ended run waits for its scraper.
+Tests metrics_server.py."""
 
 import json
 import re
+import socket
+import threading
+import urllib.request
 from dataclasses import replace
 
 import pytest
@@ -10,9 +14,12 @@ from prometheus_client.parser import text_string_to_metric_families
 from dreamfleet.common.client.status import Throughput
 from dreamfleet.common.protocol.host_classes import MAX_LISTED, HostClasses
 from dreamfleet.common.runs.records import StoredConfirmation, StoredEvaluation
+from dreamfleet.coordinator.addons.metrics import metrics_server
+from dreamfleet.coordinator.addons.metrics.metrics_server import LONGEST, ScrapeTimes
 from dreamfleet.coordinator.addons.metrics.prometheus import MAX_REASONS, MAX_WORKERS, exposition
-from tests.support.processes import ROOT
+from tests.support.processes import DEADLINE, ROOT, free_port
 from tests.support.samples import STATUS
+from tests.support.served import snapshot
 
 GRAFANA = ROOT / "deploy" / "grafana" / "dreamfleet.json"
 WORKER = replace(STATUS.worker_list[0], job_seconds=1.5, round_trip=0.02, resent=3)
@@ -44,13 +51,10 @@ def test_values_are_the_statuss():
     assert found["dreamfleet_confirmed_score"][0][1] == 118.5
 
 
-def test_unknown_values_have_no_sample():
+def test_unknown_values_and_the_error_of_a_score_of_one_episode_have_no_sample():
     found = read(replace(STATUS, last=None, recent=(), evaluation=None, best=None))
     for name in ("fitness", "evaluated_score", "confirmed_score", "temperature", "eta_seconds", "worker_job_seconds"):
         assert f"dreamfleet_{name}" not in found
-
-
-def test_a_score_of_one_episode_has_no_sample_of_its_error():
     found = read(replace(STATUS, best=StoredEvaluation(4, 1, 120.5, 0.0)))
     assert found["dreamfleet_best_evaluated_score"][0][1] == 120.5
     assert "dreamfleet_best_evaluated_score_error" not in found
@@ -103,3 +107,44 @@ def test_several_runs_share_each_metrics_head():
     assert [each.labels["run"] for each in families["dreamfleet_generation"].samples] == ["night", "lucid"]
     assert [each.labels["run"] for each in families["dreamfleet_confirmed_score"].samples] == ["night"]
     assert exposition() == b""
+
+
+def test_a_client_that_sends_a_byte_at_a_time_delays_neither_others_nor_the_end(monkeypatch):
+    monkeypatch.setattr(metrics_server, "PATIENCE", 0.5)
+    port, over = free_port(), threading.Event()
+
+    def drip():
+        with socket.create_connection(("127.0.0.1", port)) as slow:
+            slow.sendall(b"GET /metrics HTTP/1.1\r\n")
+            begun.set()
+            try:
+                while not over.wait(0.1):
+                    slow.sendall(b"X")
+            except OSError:
+                dropped.set()
+
+    begun, dropped = threading.Event(), threading.Event()
+    with metrics_server.serve_metrics(str(port), snapshot, lambda: True):
+        thread = threading.Thread(target=drip)
+        thread.start()
+        assert begun.wait(DEADLINE)
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=DEADLINE) as answer:
+            assert b"dreamfleet_generation" in answer.read()
+    assert dropped.wait(DEADLINE)
+    over.set()
+    thread.join()
+
+
+def test_an_ended_run_waits_until_its_scraper_has_seen_the_end():
+    scrapes = ScrapeTimes()
+    assert not scrapes.is_expected(0.0, 0.0)
+    scrapes.record("running", 0.0)
+    assert not scrapes.is_expected(1.0, 1.0)  # a look by hand, perhaps
+    scrapes.record("evaluating", 15.0)
+    assert scrapes.is_expected(20.0, 49.0)
+    assert not scrapes.is_expected(20.0, 50.0)
+    scrapes.record("evaluating", 3600.0)
+    assert scrapes.is_expected(3601.0, 3600.0 + LONGEST)
+    assert not scrapes.is_expected(3601.0, 3601.0 + LONGEST), "a long interval is not waited for"
+    scrapes.record("ended", 3610.0)
+    assert not scrapes.is_expected(3601.0, 3610.0)

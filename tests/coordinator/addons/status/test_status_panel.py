@@ -137,20 +137,10 @@ def test_a_refused_worker_is_told_beside_those_that_are_here():
     assert "no gymnasium" not in drawn(80, status=refused, state="ended", why="stopped")
 
 
-def test_failed_episodes_of_an_evaluation_are_told():
-    assert re.search(r"(?s)\b16 .* 1 .*4", drawn(100, evaluation=replace(STATUS.best, failed=1)))
-
-
 def test_a_curve_has_the_given_height():
     assert bar_chart([0.0, 7.0], 1) == ["▁█"]
     assert bar_chart([0.0, 15.0], 2) == [" █", "▁█"]
     assert bar_chart([3.0, 3.0], 2) == ["  ", "▁▁"]
-
-
-def test_an_ended_run_shows_its_last_generations_candidates():
-    text = drawn(100, state="ended", why="7 generations")
-    assert "7 generations" in text
-    assert re.search(r"(?s)\b6 .*8/8 .*-12\.5.*140\.0", text)
 
 
 @pytest.mark.parametrize("width", [30, 80, 200])
@@ -161,13 +151,21 @@ def test_why_a_worker_left_stands_beneath_it(width):
     assert "\x1b" not in panel
 
 
-def test_workers_beyond_the_first_are_counted():
-    assert re.search(r"\b30\b", drawn(80, workers=replace(STATUS.workers, known=31)))
+MEANS = (-1.7e308, 1.7e308), (0.0, 5e-324), (3.0, 3.0)
 
 
-def test_a_run_without_workers_shows_how_to_start_one():
-    panel = drawn(80, "--connect tcp/lab:7448", worker_list=())
-    assert "dreamfleet worker --run night --connect tcp/lab:7448" in panel
+@pytest.mark.parametrize(
+    ("changes", "shown"),
+    [
+        ({"evaluation": replace(STATUS.best, failed=1)}, r"\b16 .* 1 .*4"),
+        ({"state": "ended", "why": "7 generations"}, r"7 generations.*\b6 .*8/8 .*-12\.5.*140\.0"),  # of the last one
+        ({"workers": replace(STATUS.workers, known=31)}, r"\b30\b"),
+        ({"worker_list": ()}, "dreamfleet worker --run night --connect tcp/lab:7448"),
+        *(({"recent": tuple(replace(STATUS.last, mean=mean) for mean in means)}, "▁") for means in MEANS),
+    ],
+)
+def test_the_panel_shows(changes, shown):
+    assert re.search(f"(?s){shown}", drawn(100, "--connect tcp/lab:7448", **changes))
 
 
 def test_a_functions_run_counts_calls():
@@ -199,11 +197,6 @@ def test_untrusted_text_is_no_markup_and_cannot_control_the_terminal(workers, wh
     text = drawn(100, status=hostile(replace(STATUS, worker_list=workers)), why=why)
     assert all(each == "\n" or each.isprintable() for each in text)
     assert "[red]" in text
-
-
-@pytest.mark.parametrize("means", [(-1.7e308, 1.7e308), (0.0, 5e-324), (3.0, 3.0)])
-def test_a_sparkline_of_any_numbers(means):
-    assert "▁" in drawn(100, recent=tuple(replace(STATUS.last, mean=mean) for mean in means))
 
 
 @pytest.mark.parametrize("columns", [60, 80])
