@@ -109,6 +109,3 @@ def _parse_options(options: str) -> Variant:
 
 def _within(value: Any, low: float, high: float) -> bool:
     return type(value) in (int, float) and low <= value <= high
-
-
-DEFAULT_VARIANT = Variant()

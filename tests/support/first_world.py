@@ -23,7 +23,7 @@ from safetensors import safe_open
 
 from dreamfleet import find_bundle, find_controller
 from dreamfleet.common.artifacts.bundle import MANIFEST, write_bundle
-from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, DEFAULT_VARIANT, Variant
+from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, Variant
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES, fingerprint
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.lookup import find_subspace
@@ -224,7 +224,7 @@ def dreamt(bundle, spec, count):
 def episodes(_folder):
     """Scores and drives of controllers of every variant, as a worker computes them."""
     found, bundle = {}, find_bundle("tiny")
-    for name, variant in {"plain": DEFAULT_VARIANT, **FIRST_VARIANTS, **COSTLY}.items():
+    for name, variant in {"plain": Variant(), **FIRST_VARIANTS, **COSTLY}.items():
         fitting = bundle.with_controllers(None, variant)
         shape, steps = fitting.controller_shape, 120 if name in COSTLY else 40
         spec = TaskSpec(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, one_hot
-from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, DEFAULT_VARIANT, FACTS, Variant
+from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, FACTS, Variant
 from dreamfleet.common.artifacts.driving import parse_driving
 from dreamfleet.common.artifacts.world_facts import WorldFacts
 from dreamfleet.common.errors import UsageError
@@ -28,7 +28,7 @@ def test_options_round_trip(options):
 
 
 def test_the_default_variant_has_empty_options():
-    plain = DEFAULT_VARIANT
+    plain = Variant()
     for options in ("", '{"pedals": "two", "decide_every": 1, "time_cost": 0}'):
         assert Variant.from_json(options) == plain
     assert (plain.options, plain.is_default, plain.version, plain.extra_features) == ("", True, 1, 0)

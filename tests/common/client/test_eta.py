@@ -54,11 +54,6 @@ def test_the_pace_counts_the_evaluations_between():
     assert pace([5.0] * 12 + [60.0] * 6) == pytest.approx(60.0), "a new stage shows after six generations"
 
 
-def test_the_open_generations_elapsed_time_counts():
-    assert estimate_eta(status({"generations": 9}, gone=1.6)).seconds == pytest.approx(3.0 + 4.6)
-    assert estimate_eta(status({"generations": 8}, gone=99.0)).seconds == 0
-
-
 def test_an_overdue_generation_without_a_step_has_no_estimate():
     overdue = status({"generations": 9}, gone=69.3)
     stalled = dataclasses.replace(overdue, throughput=dataclasses.replace(overdue.throughput, steps_per_second=0.0))
@@ -66,11 +61,28 @@ def test_an_overdue_generation_without_a_step_has_no_estimate():
     assert estimate_eta(stalled).description == "7 of 9 generations, 4.6 s a generation"
 
 
-def test_a_failed_job_that_waits_for_its_next_attempt_counts():
-    failure = FailureStatus("7/1", "score", (1,), {"a": "no memory"}, {"a": 3}, retry_in=64.0)
-    evaluation = dataclasses.replace(failure, kind="evaluate")
-    assert estimate_eta(status({"generations": 8}, failures=(failure,))).seconds == pytest.approx(64.0)
-    assert estimate_eta(status({"generations": 8}, failures=(evaluation,))).seconds == pytest.approx(4.6)
+FAILURE = FailureStatus("7/1", "score", (1,), {"a": "no memory"}, {"a": 3}, retry_in=64.0)
+
+
+@pytest.mark.parametrize(
+    ("limits", "changes", "speed", "seconds"),
+    [
+        ({"generations": 9}, {"gone": 1.6}, None, 3.0 + 4.6),
+        ({"generations": 8}, {"gone": 99.0}, None, 0),
+        ({"generations": 8}, {"failures": (FAILURE,)}, None, 64.0),  # it waits for its next attempt
+        ({"generations": 8}, {"failures": (dataclasses.replace(FAILURE, kind="evaluate"),)}, None, 4.6),
+        # After workers were lost: 5 of 8 episodes are left.
+        ({"generations": 10}, {"gone": 99.0}, 0.5, 10 + 16 + 16),
+        ({"steps": 576_000}, {"paces": (8.0, 8.0)}, 0.5, 2 * 16.0),
+        ({"generations": 8}, {"paces": ()}, 0.5, 10.0),
+        ({"generations": 9}, {"paces": ()}, None, None),
+        *(({"minutes": 30.0}, {"seconds": 60.0, "state": state}, None, None)
+          for state in ("paused", "waiting for workers", "ended", "left")),
+    ],
+)  # fmt: skip
+def test_the_time_to_go_is_of_the_open_generation_and_at_the_speed_that_remains(limits, changes, speed, seconds):
+    found = estimate_eta(with_speed(status(limits, **changes), candidates=speed)).seconds
+    assert found == (seconds and pytest.approx(seconds))
 
 
 def test_steps_are_estimated_from_the_rate_of_closed_generations():
@@ -105,29 +117,17 @@ def test_once_its_limit_is_reached_a_run_is_not_at_its_end(rate):
     assert estimate_eta(with_speed(reached, evaluations=9.0)).seconds == 10.0
 
 
-def test_after_losing_workers_the_remaining_speed_counts():
-    slowed = with_speed(status({"generations": 10}, gone=99.0), candidates=0.5)  # 5 of 8 episodes are left
-    assert estimate_eta(slowed).seconds == 10 + 16 + 16
-    steps = with_speed(status({"steps": 576_000}, paces=(8.0, 8.0)), candidates=0.5)
-    assert estimate_eta(steps).seconds == pytest.approx(2 * 16.0)
-    first = with_speed(status({"generations": 8}, paces=()), candidates=0.5)
-    assert estimate_eta(first).seconds == 10.0
-
-
 def test_a_target_score_has_no_estimate():
     eta = estimate_eta(status({"target": 900.0, "parted": 3}, best=BEST))
     assert re.search(r"900 .*120\.5.* 3 evaluations.* 4\.6 s", eta.description)
     assert eta.seconds is None
 
 
-def test_without_a_number_a_generation_or_a_worker_there_is_no_estimate():
+def test_without_a_number_or_a_generation_there_is_no_estimate():
     assert estimate_eta(status(paces=())).limits == ()
     for strange in ("many", None, [1], float("nan"), -3):
         limits = dict.fromkeys(("generations", "steps", "minutes", "target", "parted"), strange)
         assert estimate_eta(status(limits, seconds=1.0)).limits == ()
-    assert estimate_eta(status({"generations": 9}, paces=())).seconds is None
-    for state in ("paused", "waiting for workers", "ended", "left"):
-        assert estimate_eta(status({"minutes": 30.0}, seconds=60.0, state=state)).seconds is None
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Tests network.py."""
+"""Tests network.py and query.py."""
 
 import re
 import socket
@@ -8,9 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 from threading import Event
 
 import pytest
+import zenoh
 
 from dreamfleet.common.errors import ConnectionFailedError, UsageError
 from dreamfleet.common.transport.network import wait_for_listener, with_interface_index
+from dreamfleet.common.transport.query import query_all, query_every_responder
 from dreamfleet.common.transport.session import Network, check_endpoint, open_session
 from tests.support.processes import DEADLINE, free_port, until
 from tests.support.wall_clock import WallClock
@@ -129,3 +131,45 @@ def test_sessions_work_whatever_the_wall_clock_says(tmp_path, years):
     (clock := WallClock(tmp_path)).set(years * 31_557_600)
     words = (*clock.inside, sys.executable, "-c", EXCHANGE, f"tcp/127.0.0.1:{free_port()}")
     assert subprocess.run(words, capture_output=True, check=True, timeout=DEADLINE).stdout == b"put query reply "
+
+
+HELD = []
+
+
+@pytest.fixture(scope="module")
+def session():
+    """A client of a router that replies to `a/*` with the query's key and payload, and never to `b`."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+
+    def answer(query):
+        with query:
+            if str(query.key_expr) == "a/wrong":
+                query.reply_err(b"no")
+                return
+            said = b"" if query.payload is None else query.payload.to_bytes()
+            query.reply(query.key_expr, str(query.key_expr).encode() + b" " + said)
+
+    with open_session(Network(listen=(endpoint,))) as router, open_session(Network(connect=(endpoint,))) as client:
+        declared = [
+            router.declare_queryable("a/*", zenoh.handlers.Callback(answer, indirect=False)),
+            router.declare_queryable("b", zenoh.handlers.Callback(HELD.append, indirect=False)),
+        ]
+        yield client
+        for each in HELD:
+            each.drop()
+        del declared
+
+
+def test_every_reply_to_every_query_is_returned_and_errors_and_unserved_keys_are_none(session):
+    assert sorted(query_all(session, ["a/1", "a/2"], 10.0)) == [b"a/1 ", b"a/2 "]
+    assert [found for _, found in query_every_responder(session, ["a/3"], 10.0, b"{}")] == [b"a/3 {}"]
+    assert query_all(session, ["a/wrong", "nobody"], 10.0) == query_all(session, [], 10.0) == []
+
+
+def test_the_timeout_ends_a_query_and_keeps_earlier_replies(session):
+    assert query_all(session, ["a/1", "b"], 0.3) == [b"a/1 "]
+
+
+def test_stopping_does_not_wait_for_the_timeout(session):
+    looks = iter([False, False, True])
+    assert list(query_every_responder(session, ["b"], 3600.0, stopped=lambda: next(looks))) == []

@@ -1,5 +1,5 @@
 """A run's journal as CSV, Parquet and TensorBoard's events, read back by those who read such files.
-Tests common/addons/analysis/scored_history.py."""
+Tests backup.py and common/addons/analysis/scored_history.py."""
 
 import csv
 import json
@@ -14,10 +14,14 @@ from dreamfleet.common.cli import command_line
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.processes import command
 from dreamfleet.common.runs.run_folder import CONFIRMED, RunFolder
+from dreamfleet.common.runs.run_paths import CONTROLLER
+from dreamfleet.coordinator.addons.runs import backup
 from dreamfleet.coordinator.addons.runs.export import export_csv, export_parquet, export_tensorboard
+from dreamfleet.coordinator.run.recall import bar_stored
 from dreamfleet.experiments.verbs.compare import SAME_SEEDS
 from tests.support.disks import small_disk
 from tests.support.events import scalars
+from tests.support.failing_runs import SETTINGS, finished
 from tests.support.journals import change_journal, confirm
 from tests.support.processes import DEADLINE, call_here, printed
 from tests.support.tables import cells
@@ -168,3 +172,24 @@ def test_a_generation_without_a_mean_is_shown_as_a_dash(runs):
     assert "-" not in shown["0"]
     history = json.loads(printed("runs", "show", "reality", "--json"))["history"]
     assert [each["mean"] is None for each in history][:2] == [False, True]
+
+
+def test_a_copy_during_which_results_are_recalled_has_no_controller_of_theirs(tmp_path, random_bundle, monkeypatch):
+    bench = finished(tmp_path, random_bundle, SETTINGS, fails=lambda job: False)
+    bench.journal.close()
+    assert (bench.path / CONTROLLER).exists()
+    copies, copy_journal = [], backup._copy_journal
+
+    def recalled_meanwhile(source, path):
+        if not copies:
+            bar_stored(bench.path, "a", is_barred=True)
+        copies.append(path)
+        copy_journal(source, path)
+
+    monkeypatch.setattr(backup, "_copy_journal", recalled_meanwhile)
+    with RunFolder(bench.path) as source:
+        backup.back_up(source, tmp_path / "safe" / bench.path.name)
+    assert len(copies) == 2
+    with RunFolder(tmp_path / "safe" / bench.path.name) as copy:
+        assert copy.checks.barred == ("a",)
+        assert not copy.controller_path.exists()

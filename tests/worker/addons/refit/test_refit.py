@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dreamfleet.common.artifacts.car_racing_variants import DEFAULT_VARIANT, Variant
+from dreamfleet.common.artifacts.car_racing_variants import Variant
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
 from dreamfleet.worker.addons.refit import refit_verb as verb
@@ -21,6 +21,7 @@ from tests.support.verbs import run_verb
 
 EYES = VAEConfig(latent=4, channels=(2, 2, 2, 2))
 MEMORY = MDNRNNConfig(latent=4, hidden=6)
+PLAIN = Variant()
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def drives(folder):
     return write_drives(folder / "data", episodes=20, steps=60)
 
 
-def controller(bundle, features="zh", hidden=0, variant=DEFAULT_VARIANT):
+def controller(bundle, features="zh", hidden=0, variant=PLAIN):
     shape = bundle.shape_of(features, hidden, variant)
     parameters = np.random.default_rng(3).normal(size=shape.size).astype(np.float32)
     return Controller(shape, parameters, "car-racing", bundle.sha256, options=variant.options)
