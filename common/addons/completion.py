@@ -1,7 +1,5 @@
 """`dreamfleet completion SHELL`: a script that completes verbs and flags in a shell."""
 
-from __future__ import annotations
-
 import argparse
 from importlib.metadata import entry_points
 from pathlib import Path

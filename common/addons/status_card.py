@@ -1,7 +1,5 @@
 """A live run in a notebook: a card of its status that is replaced in place, as plain HTML without scripts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from html import escape
 

@@ -1,7 +1,5 @@
 """The check of a new run's environment, before the run exists."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

@@ -1,7 +1,5 @@
 """Functions for users' own programs, which the package `dreamfleet` exports."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

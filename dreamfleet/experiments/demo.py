@@ -4,8 +4,6 @@ Two runs: one in the dream, and one in reality from the dream's best mean. It st
 over Zenoh; it imports neither the service nor the worker.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Searching the minimum or maximum of a Python function on a fleet, with restarts: each search is a run."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """A world model from nothing: its stages, in order, in one data folder; and stages by the flags of their verbs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial

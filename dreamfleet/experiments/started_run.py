@@ -1,7 +1,5 @@
 """A run that a user's program starts on this host, watches generation by generation, and ends."""
 
-from __future__ import annotations
-
 import json
 import os
 import time

@@ -1,7 +1,5 @@
 """`dreamfleet access init|issue|list|revoke`: a fleet's authority, and the join files that let hosts in."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from datetime import UTC, datetime

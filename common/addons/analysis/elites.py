@@ -1,7 +1,5 @@
 """A run's archive as its journal holds it, for people: elites by cell, in words, as tables and as a grid."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any, Self

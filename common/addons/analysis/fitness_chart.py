@@ -1,7 +1,5 @@
 """Parts of charts that runs and trainings share: colours, and a run's fitness by generation."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import Any

@@ -1,7 +1,5 @@
 """A run's closed generations as they are drawn and exported."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Queries about batches over Zenoh: submit one in parts, read its scores page by page, cancel it. Thread-safe."""
 
-from __future__ import annotations
-
 import queue
 from collections.abc import Callable, Sequence
 from time import monotonic

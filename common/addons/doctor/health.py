@@ -1,7 +1,5 @@
 """Checks of an installation, each with its remedy."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from collections.abc import Iterator

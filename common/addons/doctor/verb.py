@@ -1,7 +1,5 @@
 """`dreamfleet doctor`: what is installed, what each role lacks, and how to install it."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import platform

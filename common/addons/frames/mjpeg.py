@@ -3,8 +3,6 @@
 `dreamfleet live --out -` writes it, and the dashboard, which has no simulator, runs that verb and reads its output.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from typing import IO, Any, BinaryIO

@@ -1,7 +1,5 @@
 """`dreamfleet router`: a meeting point, without state, for coordinators and workers that cannot reach each other."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import logging

@@ -1,7 +1,5 @@
 """The child process of a dry run, whose environment may do anything: each wait for it ends, and nothing outlives it."""
 
-from __future__ import annotations
-
 import os
 import selectors
 import signal

@@ -1,7 +1,5 @@
 """The check of a task that needs no world model, before a run begins in it: two dry runs, each in a child process."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Mapping, Sequence

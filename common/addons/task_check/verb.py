@@ -1,7 +1,5 @@
 """`dreamfleet tasks`: the tasks that this installation can score, or the check of one of them."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Iterator

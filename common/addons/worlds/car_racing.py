@@ -1,7 +1,5 @@
 """CarRacing: presets of its runs, its published scores and its demonstration."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, FACTS

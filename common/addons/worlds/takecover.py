@@ -1,7 +1,5 @@
 """Take Cover, ViZDoom's: its presets, its published score and its demonstration."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from dreamfleet.common.worlds.profile import DemoPlan, PublishedScore, PublishedScores, ShippedScore, WorldProfile

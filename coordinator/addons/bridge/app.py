@@ -1,7 +1,5 @@
 """The bridge's routes: each request becomes queries to a coordinator over Zenoh."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import json

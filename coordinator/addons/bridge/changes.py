@@ -1,7 +1,5 @@
 """Wakes the streams of a batch when its coordinator announces a change."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress

@@ -1,7 +1,5 @@
 """The bridge's settings: address and tokens."""
 
-from __future__ import annotations
-
 import stat
 from dataclasses import dataclass
 from pathlib import Path

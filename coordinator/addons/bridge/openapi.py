@@ -1,7 +1,5 @@
 """The bridge's description of itself: OpenAPI 3.1."""
 
-from __future__ import annotations
-
 from typing import Any, get_args
 
 from dreamfleet.common.host.packages import package_version

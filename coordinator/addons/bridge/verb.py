@@ -1,7 +1,5 @@
 """`dreamfleet serve`: batches over HTTP, for searches in any language."""
 
-from __future__ import annotations
-
 import argparse
 import logging
 import sys

@@ -1,7 +1,5 @@
 """The dashboard's routes. All are GET and change nothing."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import aclosing

@@ -1,7 +1,5 @@
 """The static files of the page: our own, and plotly.js from its package."""
 
-from __future__ import annotations
-
 import gzip
 import hashlib
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Two stored runs compared for the page, by the functions of `dreamfleet compare`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

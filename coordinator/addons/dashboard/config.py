@@ -1,7 +1,5 @@
 """The dashboard's settings: address, token and limits."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from dreamfleet.common.cli.config import option

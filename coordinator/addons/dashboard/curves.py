@@ -1,7 +1,5 @@
 """The columns that the charts plot for a run, live or stored: generations and evaluations. Pure."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

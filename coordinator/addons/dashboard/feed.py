@@ -1,7 +1,5 @@
 """One snapshot a second, shared by all viewers; none while there are no viewers."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections.abc import AsyncGenerator

@@ -1,7 +1,5 @@
 """Access control of the page: it is only looked at, by a token if there is one."""
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 from html import escape

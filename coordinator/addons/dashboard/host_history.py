@@ -4,8 +4,6 @@ The journal keeps no moment of a result, so a result counts evenly over the time
 keeps no number of slots either: what is known is the slot time of results, and how many workers were there.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

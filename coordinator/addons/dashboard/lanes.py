@@ -1,7 +1,5 @@
 """What each worker did during the last minutes: one character a time slice, newest last. Pure."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Poll the live runs: each poll gives an immutable snapshot of all of them."""
 
-from __future__ import annotations
-
 import queue
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The JSON document that the page shows of a live run, apart from its curves. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The runs on this disk for the page: a list, and details of one. Only reads journals."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from contextlib import suppress

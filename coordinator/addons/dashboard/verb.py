@@ -1,7 +1,5 @@
 """`dreamfleet dashboard`: a page about live and past runs."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 

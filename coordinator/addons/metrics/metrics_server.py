@@ -1,7 +1,5 @@
 """`/metrics` of a coordinator: a read-only thread that answers from the latest snapshot."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from collections.abc import Callable, Iterator

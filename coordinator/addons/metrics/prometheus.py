@@ -4,8 +4,6 @@ The number of series is bounded: only the first `MAX_WORKERS` workers have their
 values only, shortened.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric

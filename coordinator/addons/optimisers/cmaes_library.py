@@ -6,8 +6,6 @@ constructor derives the others from its arguments. The library's history of fitn
 termination criteria read it, and its first values are uninitialised memory.
 """
 
-from __future__ import annotations
-
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence

@@ -4,8 +4,6 @@ A population of a normal distribution estimates the gradient of the expected fit
 Fitness counts by its rank alone. No step needs BLAS, so bits do not depend on how a product is split.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from abc import ABC, abstractmethod

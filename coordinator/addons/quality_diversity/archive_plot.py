@@ -1,7 +1,5 @@
 """A run's archive as a heat map: the elites' fitness in the cells of the first two axes, and the cells' numbers."""
 
-from __future__ import annotations
-
 import textwrap
 from typing import Any
 

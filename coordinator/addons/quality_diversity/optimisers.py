@@ -8,8 +8,6 @@ The library would compile parts of an update with Numba, which takes up to a min
 NumPy, and no slower as that, so we load the library with compiling turned off.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from abc import ABC, abstractmethod

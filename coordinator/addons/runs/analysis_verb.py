@@ -1,7 +1,5 @@
 """`dreamfleet runs plot|receipt`: what runs reached, drawn, and as a paper cites it."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -4,8 +4,6 @@ SQLite copies the journal as it is at one moment; everything else in the folder 
 The copy is a run like any other.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import sqlite3

@@ -1,7 +1,5 @@
 """A run's provenance as a citation for papers and reports, with the commands that reproduce it."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterator
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Export a run's journal as CSV, Parquet or TensorBoard events."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

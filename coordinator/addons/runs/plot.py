@@ -1,7 +1,5 @@
 """Plots: one run's fitness over its generations, and learning curves of several runs over the effort spent."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Callable, Sequence
 from io import BytesIO

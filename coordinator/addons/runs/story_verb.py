@@ -1,7 +1,5 @@
 """`dreamfleet story`: what happened to a run: recent events of a live one, or what its journal keeps."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import re

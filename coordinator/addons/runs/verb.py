@@ -1,7 +1,5 @@
 """`dreamfleet runs list|show|archive|backup|delete|export`: the runs on this disk."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Reading TensorBoard's event files, so that a record goes on where it ended."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

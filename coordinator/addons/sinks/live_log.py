@@ -4,8 +4,6 @@ Each reads the journal, as any reader does, and writes what its record lacks. So
 nothing: a slow or absent server, or a kill, only delays steps.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import os

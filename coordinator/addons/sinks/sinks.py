@@ -1,7 +1,5 @@
 """Records of a run's curves in other programs: the contract, and TensorBoard's."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path

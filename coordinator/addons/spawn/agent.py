@@ -5,8 +5,6 @@ line of JSON on stdin, followed by the files that it names. An answer is lines o
 or `line` as it works, then `ok` or `failed`. A lock keeps two commands from changing a host at the same time.
 """
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import importlib.metadata

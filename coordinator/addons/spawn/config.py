@@ -1,7 +1,5 @@
 """The hosts, and the settings with which a worker is started on each."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """An ssh connection to a host's agent, with an optional tunnel back, and explanations of ssh's errors."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

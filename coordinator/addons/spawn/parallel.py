@@ -1,7 +1,5 @@
 """All hosts in parallel: a thread each, a failure is a row of the table, and Ctrl-C stops them."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait

@@ -4,8 +4,6 @@ The wheel is packed from the installed files. This needs no checkout, build or n
 code as this host.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import io

@@ -3,8 +3,6 @@
 A host that answers in another form fails alone.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import threading

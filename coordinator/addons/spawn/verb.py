@@ -1,7 +1,5 @@
 """`dreamfleet spawn|down`: workers on other hosts, over ssh."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Sequence

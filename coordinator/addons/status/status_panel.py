@@ -1,7 +1,5 @@
 """A run's status as a panel for a terminal of any size: the least important lines give way; no name is truncated."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Charts of terminal characters: a curve as bars, a share as a bar, candidates as cells. No input or output."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import ceil
 

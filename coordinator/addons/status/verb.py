@@ -1,7 +1,5 @@
 """`dreamfleet status`: a run's status, once or live."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

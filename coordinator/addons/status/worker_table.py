@@ -3,8 +3,6 @@
 In a narrow terminal columns are left out in `DROP_ORDER`, in a low one the rows of unremarkable workers.
 """
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass

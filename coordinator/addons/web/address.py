@@ -1,7 +1,5 @@
 """Where a web server of an add-on listens."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from dreamfleet.common.errors import UsageError

@@ -1,7 +1,5 @@
 """Server-sent events and responses in JSON: NaN and infinity, which browsers refuse, become null."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

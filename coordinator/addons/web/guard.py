@@ -1,7 +1,5 @@
 """Access control in front of every response of a web server."""
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import re

@@ -1,7 +1,5 @@
 """Serve an application over HTTP: bounded connections, few headers, no log of its own, an end by Ctrl-C or SIGTERM."""
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import logging

@@ -1,7 +1,5 @@
 """A contrast's results: one row per trial, means over seeds, differences between kinds. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from statistics import fmean

@@ -1,7 +1,5 @@
 """A contrast's trials: each trains an MDN-RNN, freezes it and evolves in it. A killed one resumes to the same end."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial

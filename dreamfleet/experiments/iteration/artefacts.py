@@ -1,7 +1,5 @@
 """The files that an iteration made: hashes, checks, and removal."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path

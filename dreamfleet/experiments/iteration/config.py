@@ -1,7 +1,5 @@
 """What an iteration is; what of it may change while it is under way."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """The paths in an iteration's folder."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

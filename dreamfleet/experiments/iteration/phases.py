@@ -1,7 +1,5 @@
 """Run a phase: its stages, then its figures and files. A killed phase resumes to the same end."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 from collections.abc import Callable, Sequence

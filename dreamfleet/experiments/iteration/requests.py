@@ -1,7 +1,5 @@
 """What each phase asks of the stages, by the settings and what is finished alone."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass

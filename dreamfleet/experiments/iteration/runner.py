@@ -1,7 +1,5 @@
 """Run an iteration phase by phase; each is in the ledger before the next begins."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime

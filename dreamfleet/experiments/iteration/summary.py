@@ -1,7 +1,5 @@
 """What an iteration reached: one line per phase, one row per round."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

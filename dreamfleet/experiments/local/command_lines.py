@@ -3,8 +3,6 @@
 Of a flag that is given twice, the latter counts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A Python function by a name under which other processes find it: functions never travel as pickles."""
 
-from __future__ import annotations
-
 import inspect
 import os
 import sys

@@ -1,7 +1,5 @@
 """The JSON document in which an experiment keeps what it was begun with and what is finished."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

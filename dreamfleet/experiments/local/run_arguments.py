@@ -1,7 +1,5 @@
 """Settings of `start_run` and `evolve`. Written by `make reference`: change the flags."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypedDict

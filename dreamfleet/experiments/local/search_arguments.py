@@ -1,7 +1,5 @@
 """What `minimise` and `maximise` are given: numbers, bounds and parameters in the forms of SciPy and pycma."""
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """A sweep's progress: a table in a terminal, else a line for each run that changes."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence

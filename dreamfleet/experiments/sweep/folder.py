@@ -1,7 +1,5 @@
 """What a sweep keeps on disk, so that it can be resumed after everything was killed: its settings, before its runs."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial

@@ -1,7 +1,5 @@
 """A sweep: what its runs share, what varies, the runs that follow, and how they are served. Pure."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

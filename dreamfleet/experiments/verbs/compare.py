@@ -1,7 +1,5 @@
 """`dreamfleet compare`: runs or evaluation reports beside each other; the settings of sweeps."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

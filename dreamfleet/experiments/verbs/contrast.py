@@ -1,7 +1,5 @@
 """`dreamfleet lab contrast`: kinds of MDN-RNNs on equal data, several seeds each."""
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import asdict
 from pathlib import Path

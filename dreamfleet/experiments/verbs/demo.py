@@ -1,7 +1,5 @@
 """`dreamfleet demo`: everything on this machine, in minutes."""
 
-from __future__ import annotations
-
 import argparse
 import os
 from datetime import datetime

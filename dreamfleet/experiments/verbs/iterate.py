@@ -1,7 +1,5 @@
 """`dreamfleet iterate`: world models and evolutions in their dreams, in turn."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from dataclasses import asdict, replace

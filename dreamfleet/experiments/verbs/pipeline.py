@@ -1,7 +1,5 @@
 """`dreamfleet pipeline`: a world model from nothing, drives to bundle."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """`dreamfleet sweep`: many runs that differ in a few settings, on one fleet."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """`dreamfleet verify run`: re-run a run from its controller's provenance."""
 
-from __future__ import annotations
-
 import argparse
 import shlex
 import sys
