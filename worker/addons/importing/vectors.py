@@ -41,8 +41,8 @@ def read_vector(path: Path) -> NDArray[np.float64]:
         raise DatasetError(f"{path} holds no vector of numbers ({error})") from error
     if vector.ndim != 1 or not len(vector):
         raise DatasetError(f"{path} holds an array of shape {vector.shape}, not one vector")
-    if not np.isfinite(vector).all():
-        raise DatasetError(f"{path} holds NaN or infinity")
+    if not (np.abs(vector) <= np.finfo(np.float32).max).all():
+        raise DatasetError(f"{path} holds NaN, infinity, or a number that is too large for single precision")
     return vector
 
 

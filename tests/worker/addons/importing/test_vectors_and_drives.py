@@ -59,7 +59,7 @@ def test_what_pycma_wrote(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "content"),
     [
-        ("x.csv", "1, two"), ("x.csv", ""), ("x.json", "[NaN]"), ("x.json", '{"a": 1}'), ("x.dat", "% nothing"),
+        ("x.csv", "1, two"), ("x.csv", ""), ("x.json", "[NaN]"), ("x.json", "[1e39]"), ("x.json", '{"a": 1}'), ("x.dat", "% nothing"),
         ("x.exe", ""), ("x.npy", "no array"), ("x.json", "[1" + "0" * 400 + "]"), ("x.json", '["1"]'),
     ],
 )  # fmt: skip
