@@ -73,8 +73,8 @@ def _clear(target: Path, aside: Path, former: Path) -> None:
 def _check_target(source: RunFolder, target: Path) -> None:
     if target.is_symlink():
         raise UsageError(f"{target} is a link: name the folder of runs that it leads to with --to")
-    if target.exists() and target.samefile(source.path):
-        raise UsageError(f"{target} is the run itself: name another folder with --to")
+    if (target.exists() and target.samefile(source.path)) or target.resolve().is_relative_to(source.path.resolve()):
+        raise UsageError(f"{target} is the run itself, or inside it: name another folder with --to")
     if not (target / JOURNAL).exists():
         if target.exists():
             raise UsageError(f"{target} exists and is not a run: name another folder with --to")

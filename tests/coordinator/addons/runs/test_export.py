@@ -193,3 +193,10 @@ def test_a_copy_during_which_results_are_recalled_has_no_controller_of_theirs(tm
     with RunFolder(tmp_path / "safe" / bench.path.name) as copy:
         assert copy.checks.barred == ("a",)
         assert not copy.controller_path.exists()
+
+
+def test_no_copy_is_made_inside_the_run(tmp_path, random_bundle):
+    bench = finished(tmp_path, random_bundle, SETTINGS, fails=lambda job: False)
+    with RunFolder(bench.path) as source, pytest.raises(UsageError):
+        backup.back_up(source, bench.path / bench.path.name)
+    assert not (bench.path / bench.path.name).exists()
