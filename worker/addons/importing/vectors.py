@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import ControllerError, DatasetError
 from dreamfleet.common.files.archives import parse_array
 from dreamfleet.common.files.regular_files import read_regular, read_text
+from dreamfleet.common.printable import truncate
 from dreamfleet.worker.addons.importing.json_weights import read_json
 
 MOST_BYTES = 512 << 20
@@ -24,7 +26,7 @@ def read_vector(path: Path) -> NDArray[np.float64]:
     """The flat vector of a file or of pycma's output folder; `DatasetError` says why there is none.
 
     `.json`: a list of numbers, or one whose first element is that. `.npy`: one axis. `.csv`, `.txt`: numbers separated
-    by commas or blanks. A folder, or a `.dat` of it: the last row that pycma's logger wrote.
+    by commas or blanks in one row, or one a line. A folder, or a `.dat` of it: the last row that pycma's logger wrote.
     """
     if path.is_dir():
         found = next((path / name for name in CMA_FILES if (path / name).is_file()), None)
@@ -70,6 +72,8 @@ def to_parameters(vector: NDArray[Any], layout: str, shape: ControllerShape) -> 
 def _from_json(path: Path) -> NDArray[np.float64]:
     value = read_json(path)
     if isinstance(value, list) and value and isinstance(value[0], list):
+        if any(isinstance(each, list) for each in value[1:]):
+            raise ValueError("it has several lists: keep one")
         value = value[0]  # the vector, then what it scored
     if not isinstance(value, list) or not all(type(each) in (int, float) for each in value):
         raise ValueError("it is no list of numbers")
@@ -84,9 +88,21 @@ def _from_npy(path: Path) -> NDArray[np.float64]:
 
 
 def _from_text(path: Path) -> NDArray[np.float64]:
-    return np.array([float(each) for each in read_text(path, MOST_TEXT).replace(",", " ").split()])
+    text = re.sub(r",\s*\n", ", ", read_text(path, MOST_TEXT))  # a line that ends in a comma goes on
+    rows = [_numbers(line) for line in text.splitlines() if line.strip()]
+    if len(rows) > 1 and any(len(each) > 1 for each in rows):
+        raise ValueError(f"it has {len(rows)} rows: a vector is one row, or a number a line")
+    return np.array([number for row in rows for number in row])
+
+
+def _numbers(line: str) -> list[float]:
+    """The numbers of a line, separated by commas or blanks; `ValueError` for anything else."""
+    if "_" in line:  # which Python skips
+        raise ValueError(f"{truncate(line, 40)!r} has an underscore")
+    fields = line.strip().removesuffix(",").split(",")
+    return [float(each) for field in fields for each in field.split() or [""]]
 
 
 def _from_pycma(path: Path) -> NDArray[np.float64]:
     lines = [line for line in read_text(path, MOST_BYTES).splitlines() if line.strip() and line[0] not in "%#"]
-    return np.array([float(each) for each in lines[-1].split()[CMA_COLUMNS:]])
+    return np.array(_numbers(" ".join(lines[-1].split()[CMA_COLUMNS:])))

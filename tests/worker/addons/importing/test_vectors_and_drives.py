@@ -41,7 +41,9 @@ def test_files_of_vectors(tmp_path):
     (tmp_path / "v.csv").write_text("0.5,-1.25,\n3\n")
     (tmp_path / "v.json").write_text(json.dumps([vector.tolist(), 900.0]))
     (tmp_path / "flat.json").write_text(json.dumps(vector.tolist()))
-    for name in ("v.npy", "v.csv", "v.json", "flat.json"):
+    (tmp_path / "v.txt").write_text("0.5 \n-1.25\n3\n\n")
+    (tmp_path / "row.txt").write_text("0.5 -1.25, 3,\n")
+    for name in ("v.npy", "v.txt", "row.txt", "v.csv", "v.json", "flat.json"):
         assert read_vector(tmp_path / name).tolist() == vector.tolist()
 
 
@@ -59,8 +61,10 @@ def test_what_pycma_wrote(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "content"),
     [
-        ("x.csv", "1, two"), ("x.csv", ""), ("x.json", "[NaN]"), ("x.json", "[1e39]"), ("x.json", '{"a": 1}'), ("x.dat", "% nothing"),
-        ("x.exe", ""), ("x.npy", "no array"), ("x.json", "[1" + "0" * 400 + "]"), ("x.json", '["1"]'),
+        ("x.csv", "1, two"), ("x.csv", ""), ("x.csv", "1,2\n3\n"), ("x.csv", "1,,2"), ("x.txt", "1 2\n3 4"),
+        ("x.txt", "1_0 2 3"), ("x.json", "[[0,0,1],[9,9,9]]"), ("x.json", "[NaN]"), ("x.json", "[1e39]"),
+        ("x.json", '{"a": 1}'), ("x.dat", "% nothing"), ("x.dat", "0 0 0 0 0 1_0"), ("x.exe", ""),
+        ("x.npy", "no array"), ("x.json", "[1" + "0" * 400 + "]"), ("x.json", '["1"]'),
     ],
 )  # fmt: skip
 def test_what_is_no_vector_is_refused(name, content, tmp_path):
