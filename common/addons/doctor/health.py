@@ -19,8 +19,8 @@ from dreamfleet.common.security.handshake import check_certificate
 GROUP = "dreamfleet.checks"
 # The `Finding.role`s that each role needs. The extra of the last one's name installs it, except for the coordinator.
 ROLES = {
-    "coordinator": ("everything", "coordinator"),
-    "worker": ("everything", "worker"),
+    "coordinator": ("everything", "fleet", "coordinator"),
+    "worker": ("everything", "fleet", "worker"),
     "views": ("everything", "worker", "views"),
     "train": ("everything", "worker", "train"),
     "dashboard": ("everything", "dashboard"),
@@ -32,7 +32,7 @@ MIN_FREE_BYTES = 200_000_000
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one check; `role` is `everything` or one of `ROLES`, `needed` whether that role requires it."""
+    """The result of one check; `role` is one of `ROLES` or of what they need, `needed` whether it requires it."""
 
     name: str
     ok: bool
@@ -68,11 +68,11 @@ def _check_join_file(path: Path) -> Finding:
         credentials = read_join_file(path)
         check_certificate(credentials)
     except AccessError as error:
-        return Finding("join file", False, True, str(error), "everything", "have another issued")
+        return Finding("join file", False, True, str(error), "fleet", "have another issued")
     left = credentials.time_left
     found = f"{path}: {credentials.role} {credentials.name}, {describe_time_left(left)}"
     remedy = f"have {credentials.role} {credentials.name} issued again"
-    return Finding("join file", left > EXPIRY_WARNING, False, found, "everything", remedy)
+    return Finding("join file", left > EXPIRY_WARNING, False, found, "fleet", remedy)
 
 
 def missing_for_role(role: str, findings: list[Finding]) -> list[Finding]:

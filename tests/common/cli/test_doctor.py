@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dreamfleet.common.addons.doctor.health import missing_for_role, run_checks
+from dreamfleet.common.addons.doctor.health import ROLES, missing_for_role, run_checks
 from tests.support.processes import DEADLINE, ROOT, environment
 
 COORDINATOR = (
@@ -83,3 +83,10 @@ def test_a_worker_needs_a_cache_and_no_folder_for_runs(monkeypatch):
     lacking = {each.name: each.remedy for each in missing_for_role("worker", run_checks(Path("/dev/null/runs")))}
     assert "CACHE" in lacking["bundle able"], "nothing is to be installed again"
     assert "CACHE" in lacking["cache folder"]
+
+
+def test_a_join_file_is_needed_by_the_two_sides_of_a_fleet_alone(tmp_path):
+    (tmp_path / "edited.join").write_text("{}")
+    findings = run_checks(tmp_path, tmp_path / "edited.join")
+    needing = {role for role in ROLES if any(each.name == "join file" for each in missing_for_role(role, findings))}
+    assert needing == {"coordinator", "worker"}
