@@ -22,6 +22,7 @@ SPEAKERS = {
     "exception",
     "critical",
     "log",
+    "log_event",
     "print",
     "warn",
     "print_answer",

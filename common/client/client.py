@@ -36,7 +36,7 @@ from dreamfleet.common.transport.session import Network, enqueue_into, open_sess
 T = TypeVar("T")
 QUERY_TIMEOUT = 3.0
 NAMES_TIMEOUT, SHOWN_RUNS = 1.0, 4  # of the names of other runs in an error text
-PATIENCE = 1.0  # seconds without an answer after which a watched run counts as gone
+TIMEOUT = 1.0  # seconds without an answer after which a watched run counts as gone
 MAX_PARAMETERS = 16 << 20  # of a controller; the same as in a controller file
 MAX_WAITING_STATUSES = 64  # of those that coordinators publish as they leave
 MAX_RESTARTS = 5  # of fetching a controller in parts while new controllers replace it
@@ -104,22 +104,22 @@ class Client(Displayed):
             raise self._no_answer_error(run)
         return documents[0]
 
-    def watch(self, run: str, pause: float, patience: float = PATIENCE) -> Iterator[Status]:
+    def watch(self, run: str, pause: float, timeout: float = TIMEOUT) -> Iterator[Status]:
         """Yield the status of `run` every `pause` seconds, and finally the one in which its coordinator leaves.
 
-        `ConnectionFailedError` if nobody answers for `patience` seconds: the coordinator was killed, or never started.
-        Use a longer patience to wait for a coordinator that is being started.
+        `ConnectionFailedError` if nobody answers for `timeout` seconds: the coordinator was killed, or never started.
+        Use a longer timeout to wait for a coordinator that is being started.
         """
-        return map(read_status, self.watch_documents(run, pause, patience))
+        return map(read_status, self.watch_documents(run, pause, timeout))
 
-    def show(self, run: str, pause: float = 1.0, patience: float = PATIENCE) -> None:
+    def show(self, run: str, pause: float = 1.0, timeout: float = TIMEOUT) -> None:
         """Show the status of `run` in a notebook's cell, in place, until its coordinator leaves; errors as in `watch`.
 
         Interrupting the cell ends the showing and not the run. Outside of a notebook, a line of each status is printed.
         """
-        add_on("show-live")(self.watch(run, pause, patience))
+        add_on("show-live")(self.watch(run, pause, timeout))
 
-    def watch_documents(self, run: str, pause: float, patience: float = PATIENCE) -> Iterator[dict[str, Any]]:
+    def watch_documents(self, run: str, pause: float, timeout: float = TIMEOUT) -> Iterator[dict[str, Any]]:
         """Like `watch`, but yields raw statuses."""
         last_statuses: queue.SimpleQueue[Any] = queue.SimpleQueue()
         enqueue = enqueue_into(last_statuses, "status", max_waiting=MAX_WAITING_STATUSES)
@@ -131,7 +131,7 @@ class Client(Displayed):
                 try:
                     document = self.document(run)
                 except ConnectionFailedError:
-                    lost_at = monotonic() + patience if lost_at is None else lost_at
+                    lost_at = monotonic() + timeout if lost_at is None else lost_at
                     if monotonic() >= lost_at:
                         raise
                 else:

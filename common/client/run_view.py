@@ -26,7 +26,7 @@ from dreamfleet.common.runs.records import (
     format_mean,
     in_values,
 )
-from dreamfleet.common.runs.stages import describe_limit, describe_steps
+from dreamfleet.common.runs.stages import describe_limit, describe_steps, stages_of
 
 Judged = StoredEvaluation | StoredConfirmation
 NAMED_STATES = ("waiting for workers", "paused", "ended")  # whose descriptions begin with their name
@@ -48,6 +48,12 @@ class RunView:
     def task(self) -> TaskSpec:
         """What the run's jobs score."""
         return self.settings.task
+
+    @property
+    def stage_settings(self) -> RunSettings:
+        """The settings as they are in the current stage of a schedule."""
+        stages = stages_of(self.settings)
+        return self.settings if self.stage is None else stages[min(self.stage.number, len(stages)) - 1].settings
 
     @property
     def unit(self) -> str:
@@ -93,15 +99,15 @@ class RunView:
     @property
     def population(self) -> str:
         """How many candidates a generation has, and how many episodes each."""
-        size = self.stage or self.settings
+        size = self.stage_settings
         own = f"{plural(size.population, 'candidate')}, {plural(size.episodes, 'episode')} each"
         return SUBMITTED if self.settings.is_external else own
 
     @property
     def steps(self) -> str:
         """The steps of an episode, and where they come from if they are fewer than the horizon."""
-        horizon = self.task.horizon if self.stage is None else self.stage.horizon
-        driven, limit = (self.stage or self.settings).driven, self.episode_limit
+        settings, limit = self.stage_settings, self.episode_limit
+        horizon, driven = settings.task.horizon, settings.driven
         text = describe_steps(horizon, driven, dreamt=self.task.task == DREAM, limit=limit, word=self.unit)
         return text + describe_limit(horizon, limit)
 

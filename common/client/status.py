@@ -48,17 +48,10 @@ class EpisodeProgress:
 
 @dataclass(frozen=True)
 class StageStatus:
-    """The current stage of a run's schedule, and its settings."""
+    """The current stage of a run's schedule; its settings follow from the run's."""
 
     number: Count  # from 1
-    total: Count
     since: Count  # its first generation
-    horizon: Count
-    patience: Count
-    population: Count
-    episodes: Count
-    racing: bool
-    driven: float = field(default=0.0, metadata=OPTIONAL)  # share of a candidate's episodes in a dream
 
 
 @dataclass(frozen=True)

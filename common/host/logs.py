@@ -1,7 +1,7 @@
 """Logging on stderr, one line an event: as text or as JSON.
 
 Text is short: the time of day, with the date in a day's first line, the level unless it is INFO, and who speaks. A
-record may carry named values (`extra={"facts": {...}}`): JSON includes them, text does not.
+record may carry named values (`log_event`): JSON includes them, text does not.
 """
 
 from __future__ import annotations
@@ -49,6 +49,11 @@ class JsonFormatter(logging.Formatter):
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
         return json.dumps({**line, **getattr(record, "facts", {})}, default=str)
+
+
+def log_event(log: logging.Logger, event: str, text: str, *, level: int = logging.INFO, **facts: object) -> None:
+    """Log `text`; in JSON with the name of the `event` and its `facts`."""
+    log.log(level, "%s", text, extra={"facts": {"event": event, **facts}})
 
 
 def configure_logging() -> None:

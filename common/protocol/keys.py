@@ -15,7 +15,7 @@ _PREFIX = f"{ROOT}/v{PROTOCOL_VERSION}"
 RUN_PATTERN = "[A-Za-z0-9][A-Za-z0-9_-]{0,62}"
 _RUN = re.compile(RUN_PATTERN)
 _WORKER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
-_LIFE = re.compile(r"[0-9a-f]{8}")
+_PROCESS = re.compile(r"[0-9a-f]{8}")
 
 
 def check_run_name(name: str) -> str:
@@ -37,13 +37,13 @@ def _check_name(name: str, pattern: re.Pattern[str], what: str, marks: str) -> s
 
 
 def is_worker_identity(identity: str) -> bool:
-    """Whether `identity` has the form `<name>/<life>`."""
-    name, _, life = identity.partition("/")
-    return bool(_WORKER_NAME.fullmatch(name) and _LIFE.fullmatch(life))
+    """Whether `identity` has the form `<name>/<process>`."""
+    name, _, process = identity.partition("/")
+    return bool(_WORKER_NAME.fullmatch(name) and _PROCESS.fullmatch(process))
 
 
 def new_worker_identity(name: str | None = None) -> str:
-    """A new identity `<name>/<life>` of a worker process; the life is 8 random hex digits.
+    """A new identity `<name>/<process>` of a worker process; `process` is 8 random hex digits.
 
     The default name is the host's in lower case, without characters that are invalid in keys. `UsageError` for an
     invalid `name`.
@@ -107,5 +107,5 @@ def all_workers(kind: str, run: str) -> str:
 
 
 def worker_from_key(key: str) -> str:
-    """The worker's identity `<name>/<life>` in a key: its last two chunks."""
+    """The worker's identity `<name>/<process>` in a key: its last two chunks."""
     return "/".join(key.rsplit("/", 2)[-2:])

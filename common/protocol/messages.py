@@ -29,7 +29,7 @@ MAX_OPTIONS = 8_000  # characters; statuses and controllers contain them too
 MAX_END = 32  # characters of an end rule
 MAX_REASON = 400  # characters of why a worker leaves, or a run has ended
 MAX_LEASES = 1024  # of one worker; a heartbeat lists them all and must stay under MAX_MESSAGE
-MOST_TOGETHER = 8  # candidates' drives that a slot does side by side
+MAX_SIDE_BY_SIDE = 8  # candidates' drives that a slot does side by side
 MAX_BATCHES = 2**53  # never reached
 MAX_SLOTS = 4096  # of one worker
 TAG_BYTES = 8
@@ -156,7 +156,7 @@ class Job(Packed, frozen=True):
         return self.horizon, self.patience, self.driven
 
     @property
-    def runs_alone(self) -> bool:
+    def is_background(self) -> bool:
         """Whether a slot runs this job alone; candidates' jobs may share one."""
         return self.kind != "score"
 
@@ -239,7 +239,7 @@ class Heartbeat(Message, frozen=True, kw_only=True):
     # Of `capacity`, what the worker's other runs use now: jobs given to it would wait.
     taken: Annotated[int, Meta(ge=0, le=MAX_LEASES)] = 0
     # Candidates' drives that a slot does side by side; `capacity` of a dream's run counts its dreams.
-    together: Annotated[int, Meta(ge=1, le=MOST_TOGETHER)] = 1
+    side_by_side: Annotated[int, Meta(ge=1, le=MAX_SIDE_BY_SIDE)] = 1
 
 
 class BundlePart(Message, frozen=True, kw_only=True):
@@ -307,8 +307,8 @@ class HelloRequest:
     slots: Count
     packages: Packages = field(default=NUMERIC_PACKAGES, metadata=OPTIONAL)  # whose versions the fingerprint names
     host_class: HostClass = field(default="", metadata=OPTIONAL)
-    # Shows that it runs on the coordinator's own host, as its user (`common/security/anchor_key.py`); empty if not.
-    anchor: Annotated[str, Meta(max_length=64)] = field(default="", metadata=OPTIONAL)
+    # Shows that it runs on the coordinator's own host, as its user (`common/security/host_key.py`); empty if not.
+    host_token: Annotated[str, Meta(max_length=64)] = field(default="", metadata=OPTIONAL)
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ class StageSettings:
     sigma0: float | None = stage_option(None, "as --sigma0; begins a new search at the mean")
     racing: bool | None = stage_option(None, "as --racing")
     driven: Share | None = stage_option(None, "as --driven")
-    whole: bool = stage_option(False, "leave the run's subspace at the mean; needs a sigma0")
+    all_parameters: bool = stage_option(False, "leave the run's subspace at the mean; needs a sigma0")
     restart: bool = stage_option(
         False, "search anew from the run's first mean, unless the stage before reached its score"
     )
@@ -79,8 +79,8 @@ class StageSettings:
         return bool(self.generations or self.steps or self.score is not None)
 
 
-_END = ("generations", "steps", "score")
-STAGE_FIELDS = tuple(each.name for each in fields(StageSettings) if each.name not in (*_END, "whole", "restart"))
+_NO_SETTINGS = ("generations", "steps", "score", "all_parameters", "restart")
+STAGE_FIELDS = tuple(each.name for each in fields(StageSettings) if each.name not in _NO_SETTINGS)
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ class StoredFailure:
 
 
 @dataclass(frozen=True)
-class StoredWork:
+class WorkerEffort:
     """The accepted results of one worker in one generation, of one kind."""
 
     worker: str

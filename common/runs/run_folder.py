@@ -40,7 +40,7 @@ from dreamfleet.common.runs.records import (
     StoredFailure,
     StoredGeneration,
     StoredResult,
-    StoredWork,
+    WorkerEffort,
     best_evaluation,
 )
 from dreamfleet.common.runs.run_lock import is_run_locked
@@ -312,7 +312,7 @@ class RunFolder:
                 for generation, episodes, mean, std, failed in rows]  # fmt: skip
 
     def events(self) -> list[StoredEvent]:
-        """What happened to the run, oldest first: workers that came and went, pauses, failures, lives."""
+        """What happened to the run, oldest first: workers that came and went, pauses, failures, incarnations."""
         query = (
             "SELECT happened, incarnation, substr(text, 1, 1000), substr(what, 1, 100), substr(worker, 1, 100) "
             "FROM event ORDER BY number"
@@ -353,10 +353,10 @@ class RunFolder:
         """What the run took so far, and what had been spent on its start."""
         return sum((each.effort for each in self.efforts()), self.start_effort())
 
-    def work_by_worker(self) -> list[StoredWork]:
+    def effort_by_worker(self) -> list[WorkerEffort]:
         """What each worker did for each generation."""
         rows = self._journal.rows("sisiiff", WORK_QUERY)
-        return [StoredWork(worker, generation, kind, bool(confirming), results, to_finite(steps), to_finite(seconds))
+        return [WorkerEffort(worker, generation, kind, bool(confirming), results, to_finite(steps), to_finite(seconds))
                 for worker, generation, kind, confirming, results, steps, seconds in rows]  # fmt: skip
 
     def generation_times(self) -> dict[int, tuple[float, float | None]]:

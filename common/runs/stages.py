@@ -36,7 +36,7 @@ class Stage:
     settings: RunSettings
     search: int  # number of the stage that started this stage's search
     end: StageSettings
-    whole: bool = True  # whether it searches all parameters, not the run's subspace
+    all_parameters: bool = True  # whether it searches all parameters, not the run's subspace
     restart: bool = False  # whether its search begins at the run's first mean
 
     @property
@@ -65,7 +65,7 @@ class Stage:
         search = f"{anew} with step size {own.sigma0:g}" if self.starts_new_search else "the search continues"
         raced = ", racing" if own.racing else ""
         driven = ", all driven" if share == 1 else f", {share:.0%} of them driven" if share else ""
-        search += "" if self.whole else " in the subspace"
+        search += "" if self.all_parameters else " in the subspace"
         size = f"{own.population} x {plural(own.episodes, 'episode')}"
         return f"{plural(own.task.horizon, 'step')}{patience}, {size}{driven}{raced}, {search}"
 
@@ -114,7 +114,7 @@ class BegunStage:
 def stages_of(settings: RunSettings) -> tuple[Stage, ...]:
     """A run's stages in order; a run without a schedule has one."""
     end = settings.stages[0].end if settings.stages else StageSettings()
-    found = [Stage(1, settings, search=1, end=end, whole=not settings.subspace)]
+    found = [Stage(1, settings, search=1, end=end, all_parameters=not settings.subspace)]
     for each in settings.stages[1:]:
         found.append(_next_stage(found[-1], each))
     return tuple(found)
@@ -123,12 +123,13 @@ def stages_of(settings: RunSettings) -> tuple[Stage, ...]:
 def _next_stage(before: Stage, each: StageSettings) -> Stage:
     task = before.settings.task.with_overrides(each.horizon, each.patience)
     named = {name: value for name, value in each.overrides.items() if name not in TASK_FIELDS}
-    settings, whole = replace(before.settings, task=task, **named), before.whole or each.whole
+    settings = replace(before.settings, task=task, **named)
+    all_parameters = before.all_parameters or each.all_parameters
     is_other_size = settings.population != before.settings.population
-    is_changed = each.sigma0 is not None or is_other_size or whole != before.whole
+    is_changed = each.sigma0 is not None or is_other_size or all_parameters != before.all_parameters
     number = before.number + 1
     search = number if is_changed or each.restart else before.search
-    return Stage(number, settings, search=search, end=each.end, whole=whole, restart=each.restart)
+    return Stage(number, settings, search=search, end=each.end, all_parameters=all_parameters, restart=each.restart)
 
 
 def is_try(stages: Sequence[Stage | StageSettings], number: int) -> bool:

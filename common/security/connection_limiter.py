@@ -23,6 +23,8 @@ from time import sleep
 
 import zenoh
 
+from dreamfleet.common.host.logs import log_event
+
 log = logging.getLogger("dreamfleet.router")
 MAX_UNAUTHENTICATED = 32  # at 100 ms each they are closed in three seconds
 SPARE_DESCRIPTORS = 16
@@ -76,8 +78,8 @@ class _ConnectionLimiter:
                     self._close_waiting(listening)
         if blocked:
             self._close_spare()
-            log.warning("more than %d connections are unauthenticated: new ones wait", MAX_UNAUTHENTICATED,
-                        extra={"facts": {"event": "crowd", "unproven": self._unauthenticated}})  # fmt: skip
+            text = f"more than {MAX_UNAUTHENTICATED} connections are unauthenticated: new ones wait"
+            log_event(log, "crowd", text, level=logging.WARNING, unproven=self._unauthenticated)
         else:
             self._spare = _open_spare_descriptors()
 

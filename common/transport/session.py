@@ -104,7 +104,7 @@ def zenoh_config(network: Network, timeout: float | None, dictionary: str | None
     With credentials it contains their secrets; `dictionary` is the path of the users' password file.
     """
     router, credentials = bool(network.listen), network.credentials
-    room = connection_budget()  # else strangers' connections could use up the descriptors for files
+    room = connection_budget()  # else unknown senders' connections could use up the descriptors for files
     bounds = {"max_sessions": min(MAX_SESSIONS, room * 3 // 4), "accept_pending": min(MAX_SESSIONS, room // 4)}
     handshake = "" if credentials is None else f"#tls_handshake_timeout_ms={int(1000 * CONNECT_TIMEOUT)}"
     transport: dict[str, Any] = {

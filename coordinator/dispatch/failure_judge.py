@@ -22,7 +22,7 @@ class FailureJudge:
 
     def __init__(self, jobs: PendingJobs, members: Mapping[str, Member]) -> None:
         self.working_hosts: set[str] = set()  # names of those that scored jobs of this run
-        self.lacks_proof = False  # no scored job is known that could show whether a new host can score
+        self.lacks_control_job = False  # no scored job is known that could show whether a new host can score
         self._causes: set[str] = set()  # that were seen
         self._jobs = jobs
         self._members = members
@@ -41,9 +41,9 @@ class FailureJudge:
         R8: another host must have failed too, but not one that failed a job that was scored before.
         """
         failures = self._jobs.failures
-        hosts = self._present_hosts() - {one.host for each in failures if each.is_proof for one in each.attempts}
+        hosts = self._present_hosts() - {one.host for each in failures if each.is_control for one in each.attempts}
         working = self.working_hosts
-        return [each for each in failures if not each.is_proof and is_lasting(each.attempts, working, hosts)]
+        return [each for each in failures if not each.is_control and is_lasting(each.attempts, working, hosts)]
 
     def find_pausing(self) -> PendingJob | None:
         """A job that failed so often that the run must pause; `None` if there is none.
@@ -51,8 +51,8 @@ class FailureJudge:
         R8: two workers, or three attempts on the only one, show that the job itself or every host is at fault. A host
         that fails a job which others scored is faulty. This does not matter while another host works.
         """
-        forgives_proofs = bool(self._present_hosts() & self.working_hosts)
-        failures = (each for each in self._jobs.failures if not (each.is_proof and forgives_proofs))
+        forgives_control_jobs = bool(self._present_hosts() & self.working_hosts)
+        failures = (each for each in self._jobs.failures if not (each.is_control and forgives_control_jobs))
         return next((each for each in failures if _is_pausing([each])), None)
 
     def find_broken_fleet(self, *, at_once: bool) -> PendingJob | None:
@@ -74,13 +74,13 @@ class FailureJudge:
         return max(failures, key=lambda each: len(each.attempts))
 
     @property
-    def awaits_proof(self) -> bool:
+    def awaits_control_job(self) -> bool:
         """Whether only suspects and failed jobs are open, and an idle host has not scored, while others have."""
         idle = {host_of(name) for name, each in self._members.items() if each.takes_jobs and not each.leases}
         if not self.working_hosts or idle <= self.working_hosts:
             return False
         wanted = [each for each in self._jobs.values() if each.check is None]
-        return bool(wanted) and all(each.is_suspect or (each.attempts and not each.is_proof) for each in wanted)
+        return bool(wanted) and all(each.is_suspect or (each.attempts and not each.is_control) for each in wanted)
 
     @property
     def hosts_for_suspects(self) -> Collection[str]:
@@ -88,12 +88,12 @@ class FailureJudge:
 
         R8: hosts that have scored, if one is here, or if another that is here can still show that it can score.
         """
-        return () if self.lacks_proof and not self._present_hosts() & self.working_hosts else self.working_hosts
+        return () if self.lacks_control_job and not self._present_hosts() & self.working_hosts else self.working_hosts
 
     @property
-    def has_failed_proof(self) -> bool:
+    def has_failed_control_job(self) -> bool:
         """Whether a job that was scored before is wanted again and failed."""
-        return any(each.is_proof for each in self._jobs.failures)
+        return any(each.is_control for each in self._jobs.failures)
 
     @property
     def may_recover(self) -> bool:

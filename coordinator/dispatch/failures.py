@@ -12,7 +12,7 @@ WORKER_ENDED = Failure.of_host("its worker was lost")
 
 
 def host_of(worker: str) -> str:
-    """A worker's name without its life: attempts on one host are less independent than on two."""
+    """A worker's name without its process: attempts on one host are less independent than on two."""
     return worker.partition("/")[0]
 
 

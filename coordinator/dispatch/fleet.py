@@ -27,7 +27,7 @@ from dreamfleet.coordinator.dispatch.pending_jobs import PendingJobs
 from dreamfleet.coordinator.dispatch.speculative_execution import SpeculativeExecution
 from dreamfleet.coordinator.dispatch.worker_selection import assign_jobs
 from dreamfleet.coordinator.jobs.checks import Check
-from dreamfleet.coordinator.jobs.work import Work
+from dreamfleet.coordinator.jobs.scoring_job import ScoringJob
 
 DEPARTURE_GRACE = 0.05  # seconds: a vanished token overtakes results that are still on their way
 CLOCK_GAP = 2.0  # seconds between ticks that mean that this host was suspended
@@ -38,8 +38,8 @@ REPLY_AFTER = 2  # a worker to which nothing was sent gets an empty batch
 RESEND_AFTER = 2  # an unconfirmed batch is sent again
 # In seconds without a message:
 FORGET_AFTER = 600.0  # a worker is forgotten and must say hello again
-GUEST_TIMEOUT = 60.0  # the same for a guest
-MAX_GUESTS = 256
+UNCONFIRMED_TIMEOUT = 60.0  # the same for one that has sent no heartbeat
+MAX_UNCONFIRMED = 256
 
 
 class Fleet:
@@ -63,23 +63,23 @@ class Fleet:
         self.failure_judge = FailureJudge(self.jobs, self.members)
         self.drain_background = False  # only evaluations and kept rollouts are left to wait for
         self.paused = False
-        self.checked: Work | None = None  # the job whose accepted result the last result repeats
+        self.checked: ScoringJob | None = None  # the job whose accepted result the last result repeats
 
     def add_worker(self, identity: str, slots: int, fingerprint: str, now: float) -> int:
-        """Welcome a worker as a guest; return the numbering of its batches.
+        """Welcome a worker, unconfirmed; return the numbering of its batches.
 
         R12: a welcome starts a new numbering, so messages from before cannot be mistaken for current ones. R19: hello
-        in the name of a live worker changes nothing, so a stranger cannot take its leases; that worker only gets again
-        what it may have missed. R26: the number of guests is bounded.
+        in the name of a live worker changes nothing, so an unknown sender cannot take its leases. That worker only gets
+        again what it may have missed. R26: the number of unconfirmed workers is bounded.
         """
         old, recent = self.members.get(identity), ALIVE_WITHIN * self._interval
         if old is not None and old.state is MemberState.PRESENT and now - old.last_heard <= recent:
             old.resend_sent_before(now - self._interval)
             return old.numbering
         self.remove_worker(identity)
-        guests = [member for member in self.members.values() if member.is_guest]
-        if len(guests) >= MAX_GUESTS:
-            self.remove_worker(guests[0].identity)
+        unconfirmed = [member for member in self.members.values() if member.is_unconfirmed]
+        if len(unconfirmed) >= MAX_UNCONFIRMED:
+            self.remove_worker(unconfirmed[0].identity)
         slots, joined_at = min(slots, MAX_SLOTS), now if old is None else old.joined_at
         host_stats = self._hosts.join(identity, None if old is None else old.host_stats)
         numbering = next(self._numberings)
@@ -109,13 +109,13 @@ class Fleet:
         """Compare what a worker reports with what it was given.
 
         R3, R20: a lease that the worker does not show ends. R11: a confirmed batch is not sent again. R19: the first
-        heartbeat makes a guest a member.
+        heartbeat confirms a worker.
         """
         member, self.event_log.now = self.members.get(identity), now
         if member is None:
             return
         self._mark_heard(member, now)
-        if member.is_guest:  # R26: only now is it logged, as strangers could fill the log with names
+        if member.is_unconfirmed:  # R26: only now is it logged, as unknown senders could fill the log with names
             self._note_arrival(identity, "back" if identity in self.departed else "joined")
             self.departed.remove(identity)
             if beat.reason:  # R24: it fails before it can score, and has no token that could vanish
@@ -137,16 +137,18 @@ class Fleet:
 
     def handle_result(
         self, identity: str, result: Result, now: float, host_class: str = ""
-    ) -> tuple[VerdictWord, Work | None]:
+    ) -> tuple[VerdictWord, ScoringJob | None]:
         """Judge one result; return its work if it is the first valid one of a wanted job, for the journal.
 
-        R5: a stranger's result is dropped. R7: a worker of this run gets a verdict on each result, a duplicate too, so
-        it can stop repeating it. `checked` is the work of a result that repeats an accepted one (R32).
+        R5: an unknown worker's result is dropped. R7: a worker of this run gets a verdict on each result, a duplicate
+        too, so it can stop repeating it. `checked` is the work of a result that repeats an accepted one (R32).
         """
         member, self.event_log.now, self.checked = self.members.get(identity), now, None
         given = self.find_job_for_result(identity, result)
-        if given is None and (member is None or member.is_guest):
-            self.dropped["result of a stranger"] += 1  # a worker of this run repeats it after its first heartbeat
+        if given is None and (member is None or member.is_unconfirmed):
+            self.dropped["result of an unknown worker"] += (
+                1  # a worker of this run repeats it after its first heartbeat
+            )
             return "refused", None
         if member is not None:
             self._mark_heard(member, now)
@@ -170,17 +172,17 @@ class Fleet:
         self.counts[verdict] += 1
         return verdict, work
 
-    def find_job_for_result(self, identity: str, result: Result) -> Work | None:
+    def find_job_for_result(self, identity: str, result: Result) -> ScoringJob | None:
         """The wanted job that this worker may answer with this result; `None` if there is none.
 
-        R5: a result counts from a worker that was given the job in this life of the coordinator, with or without the
-        lease. If an earlier life may have given the job, it counts from any worker that has sent a heartbeat. An error
-        counts only from a holder of the lease. So a stranger can neither score nor fail a job.
+        R5: a result counts from a worker that was given the job in this incarnation, with or without the lease. If an
+        earlier incarnation may have given the job, it counts from any worker that has sent a heartbeat. An error counts
+        only from a holder of the lease. So an unknown sender can neither score nor fail a job.
         """
         pending, member = self.jobs.get(result.digest), self.members.get(identity)
         if pending is None or not self.jobs.may_have_been_given(result.digest, identity):
             return None
-        known = identity in pending.given_to or (member is not None and not member.is_guest)
+        known = identity in pending.given_to or (member is not None and not member.is_unconfirmed)
         return pending.work if known and (result.fitness is not None or identity in pending.holders) else None
 
     def overrun(self, identity: str, digest: bytes) -> None:
@@ -222,7 +224,7 @@ class Fleet:
                     self._release_lost(member, now, member.departure)
                     self.remove_worker(member.identity)
                     self.departed.add(member)
-            elif now - member.last_heard > (GUEST_TIMEOUT if member.is_guest else FORGET_AFTER):
+            elif now - member.last_heard > (UNCONFIRMED_TIMEOUT if member.is_unconfirmed else FORGET_AFTER):
                 self.remove_worker(member.identity)
             elif not member.silent and now - member.last_heard > SILENT_AFTER * self._interval:
                 member.silent = True
@@ -260,10 +262,10 @@ class Fleet:
 
     def _share_slots(self) -> None:
         """Let a slot do only so many drives side by side that two rounds are left for each, so that none idles."""
-        able = [member for member in self.members.values() if member.together > 1]
+        able = [member for member in self.members.values() if member.side_by_side > 1]
         slots = sum(member.slots for member in self.members.values() if member.takes_jobs) if able else 0
         for member in able:
-            member.drives_a_slot = max(1, (len(self.jobs) + self.jobs.unmade) // max(2 * slots, 1))
+            member.drives_per_slot = max(1, (len(self.jobs) + self.jobs.unmade) // max(2 * slots, 1))
 
     @property
     def has_workers(self) -> bool:
@@ -288,7 +290,7 @@ class Fleet:
             self.dropped["count of batches"] += 1
         return replace(beat, seen=0, queued=())
 
-    def _plan(self, now: float) -> dict[str, list[Work]]:
+    def _plan(self, now: float) -> dict[str, list[ScoringJob]]:
         """The work that each member is given now."""
         judge = self.failure_judge
         given = assign_jobs(
@@ -302,7 +304,9 @@ class Fleet:
             self.leases.move(move, given)
         return given
 
-    def _new_batches(self, member: Member, given: Sequence[Work], durable: bool, now: float) -> Iterator[SentBatch]:
+    def _new_batches(
+        self, member: Member, given: Sequence[ScoringJob], durable: bool, now: float
+    ) -> Iterator[SentBatch]:
         """New batches.
 
         R10: they are numbered without a gap, so the worker can report how many it has.
@@ -322,8 +326,8 @@ class Fleet:
             member.verdicts = []
 
     def _judge(
-        self, identity: str, result: Result, given: Work | None, host_class: str
-    ) -> tuple[VerdictWord, Work | None]:
+        self, identity: str, result: Result, given: ScoringJob | None, host_class: str
+    ) -> tuple[VerdictWord, ScoringJob | None]:
         """The verdict on a result, and its work if it is accepted.
 
         R4: only the first valid result of a wanted job is accepted. R8: an error is recorded, never a fitness.
@@ -348,12 +352,12 @@ class Fleet:
         pending = self.jobs.accept(result)
         self.counts["discarded_steps"] += pending.steps_lost_to(identity, result.steps)
         pending.holders -= {identity}
-        if self.jobs.is_drawn(pending.work) and not pending.is_proof:
+        if self.jobs.is_drawn(pending.work) and not pending.is_control:
             self.leases.check_again(pending, Check(host_class, {host_of(identity)}))
         else:
             self.leases.cancel(pending)
         self.failure_judge.working_hosts.add(host_of(identity))
-        return ("duplicate", None) if pending.is_proof else ("accepted", pending.work)
+        return ("duplicate", None) if pending.is_control else ("accepted", pending.work)
 
     def _note_failure(self, digest: bytes) -> None:
         """Count a failed attempt; the first one of each cause is logged."""
@@ -369,7 +373,7 @@ class Fleet:
 
     def _mark_heard(self, member: Member, now: float) -> None:
         member.last_heard = now
-        if member.silent and not member.is_guest:  # a guest's silence was not logged either
+        if member.silent and not member.is_unconfirmed:  # an unconfirmed one's silence was not logged either
             self._note_arrival(member.identity, "back")
         member.silent = False
         member.held_at_silence.clear()
@@ -381,8 +385,8 @@ class Fleet:
 
     def _release_lost(self, member: Member, now: float, what: str) -> None:
         """Release and log a worker that is gone or silent; its host's record counts a loss of jobs."""
-        if member.is_guest:
-            return  # it has no jobs, and a stranger can invent names without end
+        if member.is_unconfirmed:
+            return  # it has no jobs, and an unknown sender can invent names without end
         freed = f"; {plural(len(member.leases), 'job')} requeued" if member.leases else ""
         gone: EventKind = "silent" if member.gone_since is None else "lost" if member.is_lost else "left"
         self.notes.append(Note(f"worker {member.identity} {what}{freed}", gone, member.identity))

@@ -156,7 +156,7 @@ class HostRecords:
         last = self._records.pop(name, None)
         host_stats = current or (last.copy() if last else HostStats())
         self._records[name] = host_stats
-        while len(self._records) > MAX_HOSTS:  # R26: strangers can invent names without end
+        while len(self._records) > MAX_HOSTS:  # R26: unknown senders can invent names without end
             del self._records[next(iter(self._records))]
         return host_stats
 

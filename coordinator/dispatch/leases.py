@@ -11,7 +11,7 @@ from dreamfleet.coordinator.dispatch.member import DispatchGroup, Lease, Member
 from dreamfleet.coordinator.dispatch.pending_jobs import JobState, PendingJob, PendingJobs
 from dreamfleet.coordinator.dispatch.speculative_execution import Move
 from dreamfleet.coordinator.jobs.checks import Check
-from dreamfleet.coordinator.jobs.work import Work
+from dreamfleet.coordinator.jobs.scoring_job import ScoringJob
 
 
 class Leases:
@@ -28,7 +28,7 @@ class Leases:
     def add(self, member: Member, digest: bytes, batch: int, group: DispatchGroup, steps: int | None = None) -> None:
         """Note that a worker has a job, or is sent it in this batch; `steps` are those that it has made already."""
         job = self._jobs[digest].work.job
-        lease = Lease(batch, group, job.runs_alone, bool(job.driven), steps=steps, steps_seen_at=self._event_log.now)
+        lease = Lease(batch, group, job.is_background, bool(job.driven), steps=steps, steps_seen_at=self._event_log.now)
         member.add_lease(digest, lease)
         self._jobs.add_holder(digest, member.identity)
 
@@ -61,7 +61,7 @@ class Leases:
         member.unconfirmed.clear()
         member.trial_copies.clear()
 
-    def move(self, move: Move, given: dict[str, list[Work]]) -> None:
+    def move(self, move: Move, given: dict[str, list[ScoringJob]]) -> None:
         """Give a job to an idle slot, as a copy or instead of to its former holder; `given` is what is to be sent."""
         if move.donor:
             donor = self._members[move.donor]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 
 from dreamfleet.common.printable import one_line
-from dreamfleet.common.protocol.messages import MAX_LEASES, MOST_TOGETHER, Heartbeat, Job, Result, Verdict
+from dreamfleet.common.protocol.messages import MAX_LEASES, MAX_SIDE_BY_SIDE, Heartbeat, Job, Result, Verdict
 from dreamfleet.coordinator.dispatch.host_stats import HostStats
 from dreamfleet.coordinator.dispatch.packing import SentBatch
 
@@ -23,7 +23,7 @@ MAX_DEPARTED = 256  # departed workers that are listed, the latest ones
 class MemberState(Enum):
     """A member's state; one that departed is no member any more (`DepartedWorkers`)."""
 
-    GUEST = auto()  # welcomed, no heartbeat yet: anybody can say hello
+    UNCONFIRMED = auto()  # welcomed, no heartbeat yet: anybody can say hello
     PRESENT = auto()
     SILENT = auto()  # no message for several intervals: it has no leases
     GONE = auto()  # its token vanished: results that are under way have a moment to arrive
@@ -69,19 +69,19 @@ class Member:
     capacity: int = 0
     batch_size: int = 1  # candidates' jobs that one of its slots scores at once
     taken: int = 0  # of its capacity, what its other runs use now
-    together: int = 1  # candidates' drives that one of its slots does side by side
-    drives_a_slot: int = MOST_TOGETHER  # of these, as many as leave work for all slots; set before each dispatch
+    side_by_side: int = 1  # candidates' drives that one of its slots does side by side
+    drives_per_slot: int = MAX_SIDE_BY_SIDE  # of these, as many as leave work for all slots; set before each dispatch
     gone_since: float | None = None  # when its token vanished, or its first heartbeat was its last
     farewell: str = ""  # why it leaves, by its last heartbeat
     silent: bool = False
-    is_guest: bool = True  # until its first heartbeat
+    is_unconfirmed: bool = True  # until its first heartbeat
     number: int = 0  # of the last batch in its numbering
     confirmed: int = 0  # the worker has all batches up to this number
     load: float = 0.0
     steps_per_second: float = 0.0
     drawn_by: str = "-"
     host_class: str = ""  # empty: not known yet
-    is_anchor: bool = False  # it has shown that it is on the coordinator's own host
+    is_trusted: bool = False  # it has shown that it is on the coordinator's own host
     is_held: bool = False  # it differs from another host, and nobody has decided which of them is wrong
     finished: int = 0  # accepted results
     was_ready: bool = False  # some heartbeat named a slot that scores
@@ -103,8 +103,8 @@ class Member:
         """Its state now."""
         if self.gone_since is not None:
             return MemberState.GONE
-        if self.is_guest:
-            return MemberState.GUEST
+        if self.is_unconfirmed:
+            return MemberState.UNCONFIRMED
         return MemberState.SILENT if self.silent else MemberState.PRESENT
 
     @property
@@ -126,7 +126,7 @@ class Member:
 
     @property
     def is_reachable(self) -> bool:
-        """Whether it is present, or a guest that was heard lately."""
+        """Whether it is present, or unconfirmed and was heard lately."""
         return self.gone_since is None and not self.silent
 
     @property
@@ -160,14 +160,14 @@ class Member:
 
     def share_of(self, job: Job) -> int:
         """How much of its `capacity` a job takes: one that runs alone takes a whole slot, a drive its part of one."""
-        return self._share(job.runs_alone, bool(job.driven))
+        return self._share(job.is_background, bool(job.driven))
 
-    def _share(self, runs_alone: bool, is_driven: bool) -> int:
-        if runs_alone:
+    def _share(self, is_background: bool, is_driven: bool) -> int:
+        if is_background:
             return self.batch_size
-        if not is_driven and self.batch_size > self.together:
+        if not is_driven and self.batch_size > self.side_by_side:
             return 1
-        return math.ceil(self.batch_size / min(self.together, self.drives_a_slot))
+        return math.ceil(self.batch_size / min(self.side_by_side, self.drives_per_slot))
 
     @property
     def held_share(self) -> int:
@@ -211,13 +211,13 @@ class Member:
     def apply_heartbeat(self, beat: Heartbeat, now: float) -> list[SentBatch]:
         """Take what a heartbeat says of the worker; return the batches that it confirms for the first time.
 
-        R11: a batch is kept until a heartbeat confirms it. R19: the first heartbeat turns a guest into a member
+        R11: a batch is kept until a heartbeat confirms it. R19: the first heartbeat confirms the worker
         with credit.
         """
-        self.is_guest = False
+        self.is_unconfirmed = False
         self.farewell = one_line(beat.reason)
         self.capacity, self.slots, self.confirmed = beat.capacity, beat.slots, beat.seen
-        self.taken, self.together = beat.taken, beat.together
+        self.taken, self.side_by_side = beat.taken, beat.side_by_side
         self.batch_size = max(self.batch_size, math.ceil(beat.capacity / max(beat.slots, 1)))
         self.was_ready = self.was_ready or beat.capacity > 0
         self.load, self.steps_per_second, self.drawn_by = beat.load, beat.steps_per_second, beat.drawn_by
@@ -247,18 +247,18 @@ class Member:
             lease.finished = digest in finished
         return [digest for digest, lease in self.leases.items() if lease.absent_heartbeats >= ABSENT_HEARTBEATS]
 
-    def take_overdue_batches(self, now: float, patience: float) -> Iterator[SentBatch]:
+    def take_overdue_batches(self, now: float, after: float) -> Iterator[SentBatch]:
         """Batches to send again.
 
-        R11: a batch is due after `patience` and the time that the link needs for all that is on the way, then after
-        twice as long each time, so a slow link is not flooded.
+        R11: a batch is due after `after` seconds and the time that the link needs for all that is on the way, then
+        after twice as long each time, so a slow link is not flooded.
         """
         ahead = 0
         for sent in self.unconfirmed.values():
             ahead += sent.size
             # The link is free since the last delivery.
             since = sent.sent_at if sent.sent_at == -math.inf else max(sent.sent_at, self.last_delivery)
-            pause = patience + self.host_stats.transfer_seconds(ahead)
+            pause = after + self.host_stats.transfer_seconds(ahead)
             if now - since > pause * 2 ** min(sent.times - 1, MAX_BACKOFF):
                 sent.sent_at, sent.times = now, sent.times + 1
                 self.resent += 1
@@ -315,12 +315,12 @@ class Member:
             digest: each for digest, each in self.trial_copies.items() if now - each.given_at < TRIAL_SECONDS
         }
 
-    def is_owed_reply(self, now: float, patience: float) -> bool:
-        """Whether it has spoken since the coordinator last did, and that was longer than `patience` ago.
+    def is_owed_reply(self, now: float, after: float) -> bool:
+        """Whether it has spoken since the coordinator last did, and that was longer than `after` seconds ago.
 
         R22: a worker without any answer would say hello again.
         """
-        return self.is_reachable and self.last_heard > self.last_sent and now - self.last_sent > patience
+        return self.is_reachable and self.last_heard > self.last_sent and now - self.last_sent > after
 
     def shift_clock(self, gap: float) -> None:
         """Add `gap` seconds to all that is timed.
@@ -340,13 +340,13 @@ class DepartedWorkers(dict[str, Member]):
 
     def add(self, member: Member) -> None:
         """List a worker that is gone, unless it had drained and gave no reason."""
-        if not member.is_guest and (member.capacity or member.farewell):
+        if not member.is_unconfirmed and (member.capacity or member.farewell):
             self[member.identity] = member
             if len(self) > MAX_DEPARTED:  # R26: the list is bounded
                 del self[next(iter(self))]
 
     def remove(self, identity: str) -> None:
-        """Unlist a worker that is back; else one of the same host, of which this is another life."""
+        """Unlist a worker that is back; else one of the same host, of which this is another process."""
         host = identity.partition("/")[0]
         others = (name for name in self if name.partition("/")[0] == host)
         self.pop(identity if identity in self else next(others, ""), None)

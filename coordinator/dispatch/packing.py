@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from msgspec.structs import replace
 
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, MAX_PART, VectorPart, Verdict
-from dreamfleet.coordinator.jobs.work import Work
+from dreamfleet.coordinator.jobs.scoring_job import ScoringJob
 
 # Bytes of msgpack, rounded up: the envelope, and each item without its variable part.
 _ENVELOPE, _JOB, _VECTOR, _CANCEL, _VERDICT = 1024, 400, 160, 40, 80
@@ -22,7 +22,7 @@ class SentBatch:
     numbering: int
     number: int = 0
     vectors: list[VectorPart] = field(default_factory=list)
-    work: list[Work] = field(default_factory=list)
+    work: list[ScoringJob] = field(default_factory=list)
     cancels: list[bytes] = field(default_factory=list)
     verdicts: list[Verdict] = field(default_factory=list)
     size: int = _ENVELOPE  # an upper bound of its bytes
@@ -32,7 +32,7 @@ class SentBatch:
 
 
 def pack(
-    identity: str, numbering: int, work: Sequence[Work], cancels: Sequence[bytes], verdicts: Sequence[Verdict]
+    identity: str, numbering: int, work: Sequence[ScoringJob], cancels: Sequence[bytes], verdicts: Sequence[Verdict]
 ) -> list[SentBatch]:
     """Everything, in order, in as few batches as fit; they have no numbers yet.
 
@@ -64,7 +64,7 @@ def pack(
     return [batch for batch in batches if batch.size > _ENVELOPE]
 
 
-def vector_parts(work: Work) -> Iterator[VectorPart]:
+def vector_parts(work: ScoringJob) -> Iterator[VectorPart]:
     """A job's vector: one part unless it is longer than a message."""
     first = VectorPart(
         id=work.job.vector, dtype="<f4", shape=(len(work.vector) // 4,), offset=0, data=work.vector[:MAX_PART]

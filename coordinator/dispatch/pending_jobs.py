@@ -14,7 +14,7 @@ from dreamfleet.common.protocol.messages import TAG_BYTES, Kind, Result
 from dreamfleet.coordinator.dispatch.deficit_round_robin import DeficitCounter
 from dreamfleet.coordinator.dispatch.failures import LONGEST_ERROR, WORKER_ENDED, Attempt, host_of, pause_before_retry
 from dreamfleet.coordinator.jobs.checks import Check
-from dreamfleet.coordinator.jobs.work import Work
+from dreamfleet.coordinator.jobs.scoring_job import ScoringJob
 
 MAX_FAILED = 64  # failed attempts of a job that are remembered
 MAX_NAMED = 4  # workers that the description of a failure names
@@ -35,7 +35,7 @@ class JobState(Enum):
 class PendingJob:
     """A job without a result. A generation has many, so what most of them lack is shared."""
 
-    work: Work
+    work: ScoringJob
     order: int
     queued: int | None = None  # the order of its entry in a queue; the entry may outlive the state `QUEUED`
     holders: frozenset[str] = frozenset()  # workers that have a lease
@@ -43,7 +43,7 @@ class PendingJob:
     overrun_by: frozenset[str] = frozenset()  # workers that reported more steps than it can have
     attempts: tuple[Attempt, ...] = ()  # the failed ones
     lost_with: tuple[str, ...] = ()  # workers that ended while they held it
-    is_proof: bool = False  # it was scored before: who scores it again shows that a host can score
+    is_control: bool = False  # a control job: it was scored before: who scores it again shows that a host can score
     check: Check | None = None  # it has an accepted result, which another host is to repeat
     retry_at: float = 0.0  # seconds of the monotonic clock before which it is not tried again
     # Workers that lost their lease, and the environment steps that each had made; `None`: it had finished.
@@ -64,7 +64,7 @@ class PendingJob:
     @property
     def is_suspect(self) -> bool:
         """Whether it may be what ended the workers that held it."""
-        return len(self.lost_with) >= SUSPECT_LOSSES and not self.is_proof
+        return len(self.lost_with) >= SUSPECT_LOSSES and not self.is_control
 
     @property
     def avoided_workers(self) -> Set[str]:
@@ -111,7 +111,9 @@ class PendingJobs(Mapping[bytes, PendingJob]):
     """Every wanted job by its digest. Workers are only names here."""
 
     def __init__(self, evaluation_share: float) -> None:
-        self.previous_epoch_until = -1  # an earlier life of the coordinator may have given jobs up to this generation
+        self.given_before_until = (
+            -1
+        )  # an earlier incarnation of the coordinator may have given jobs up to this generation
         self._pending: dict[bytes, PendingJob] = {}
         self._tags: dict[bytes, bytes] = {}  # first bytes of a digest -> digest
         self._queue: list[tuple[int, bytes]] = []  # candidates' jobs, in order of offer
@@ -124,7 +126,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         self._waiting: set[bytes] = set()  # failing jobs before their next attempt
         self._accepted: dict[bytes, int] = {}  # digest -> generation, of this generation and the last
         self.checks: dict[bytes, PendingJob] = {}  # wanted jobs whose accepted result another host is to repeat
-        self.is_drawn: Callable[[Work], bool] = lambda _: False  # whether a job's result is to be checked
+        self.is_drawn: Callable[[ScoringJob], bool] = lambda _: False  # whether a job's result is to be checked
 
     def __getitem__(self, digest: bytes) -> PendingJob:
         return self._pending[digest]
@@ -135,7 +137,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
     def __len__(self) -> int:
         return len(self._pending)
 
-    def work(self, digest: bytes) -> Work | None:
+    def work(self, digest: bytes) -> ScoringJob | None:
         """The work of a wanted job; `None` if it is not wanted."""
         pending = self._pending.get(digest)
         return None if pending is None else pending.work
@@ -147,11 +149,11 @@ class PendingJobs(Mapping[bytes, PendingJob]):
     def may_have_been_given(self, digest: bytes, worker: str) -> bool:
         """Whether a worker may have a wanted job.
 
-        R5: it was given the job in this life of the coordinator; or an earlier life may have given it, to anybody.
+        R5: it was given the job in this incarnation; or an earlier one may have given it, to anybody.
         """
         pending = self._pending[digest]
-        may_be_of_earlier_life = pending.check is None and pending.work.job.generation <= self.previous_epoch_until
-        return worker in pending.given_to or may_be_of_earlier_life
+        may_be_given_before = pending.check is None and pending.work.job.generation <= self.given_before_until
+        return worker in pending.given_to or may_be_given_before
 
     def is_accepted(self, digest: bytes) -> bool:
         """Whether its result was accepted, in this generation or the last."""
@@ -162,7 +164,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         """Candidates' jobs that wait, those included that are not made yet; an entry may outlive its job."""
         return len(self._queue) + self.unmade
 
-    def offer(self, work: Iterable[Work]) -> None:
+    def offer(self, work: Iterable[ScoringJob]) -> None:
         """Want these jobs, except those that are wanted or accepted already.
 
         R3: a wanted job goes into the queue, so some worker will get it.
@@ -180,15 +182,15 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         self._next_order += 1
         self.enqueue(digest)
 
-    def offer_proof(self, work: Work) -> bool:
+    def offer_control_job(self, work: ScoringJob) -> bool:
         """Want a job again that was scored before; `False` if it is wanted already."""
         digest = work.digest
         if digest in self._pending:
             return False
-        self._add(PendingJob(work, self._next_order, is_proof=True))
+        self._add(PendingJob(work, self._next_order, is_control=True))
         return True
 
-    def offer_check(self, work: Work, check: Check, holders: Iterable[str] = ()) -> None:
+    def offer_check(self, work: ScoringJob, check: Check, holders: Iterable[str] = ()) -> None:
         """Want a job again whose result was accepted; the `holders` may finish it."""
         digest, pending = work.digest, PendingJob(work, self._next_order, check=check)
         self._pending[digest] = self.checks[digest] = pending
@@ -208,11 +210,11 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         return [digest for digest, pending in self._pending.items() if pending.work.kind == kind]
 
     def plain_scores(self) -> Sequence[bytes]:
-        """The digests of the wanted jobs of candidates that are no proof and no check."""
+        """The digests of the wanted jobs of candidates that are no control jobs and no checks."""
         return [
             digest
             for digest, pending in self._pending.items()
-            if not (pending.is_background or pending.is_proof or pending.check)
+            if not (pending.is_background or pending.is_control or pending.check)
         ]
 
     def enqueue(self, digest: bytes) -> None:
@@ -275,7 +277,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         is the failure of that one and not of its company.
         """
         pending = self._pending[digest]
-        is_failure = pending.is_suspect or pending.is_proof
+        is_failure = pending.is_suspect or pending.is_control
         pending.lost_with = (*pending.lost_with, worker)
         if is_failure:
             self._add_attempt(digest, Attempt(worker, WORKER_ENDED), now)

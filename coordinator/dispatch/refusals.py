@@ -13,7 +13,7 @@ from dreamfleet.common.protocol.messages import HelloRequest
 from dreamfleet.common.protocol.tasks import ARGUMENTS, is_unregistered, module_of
 
 MAX_REFUSED = 8  # names that are remembered
-MAX_LOGGED = 100  # refusals that are logged: a stranger can invent names without end
+MAX_LOGGED = 100  # refusals that are logged: an unknown sender can invent names without end
 MAX_TASKS = 8  # of a worker that a refusal names
 LONGEST = 600  # characters of what a worker says of itself: two of them fit into an answer
 

@@ -15,7 +15,7 @@ from dreamfleet.coordinator.dispatch.host_stats import HostStats
 from dreamfleet.coordinator.dispatch.member import Lease, Member
 from dreamfleet.coordinator.dispatch.pending_jobs import JobState, PendingJob
 from dreamfleet.coordinator.dispatch.worker_selection import is_dependable
-from dreamfleet.coordinator.jobs.work import Work
+from dreamfleet.coordinator.jobs.scoring_job import ScoringJob
 
 SMOOTHING = 0.1  # weight of the newest episode in the typical one
 QUIET_INTERVALS = 2  # heartbeat intervals without a message after which a holder's jobs may be copied
@@ -62,7 +62,7 @@ class SpeculativeExecution:
         """Note the length of an accepted episode."""
         self._typical_steps += SMOOTHING * (steps - self._typical_steps) if self._typical_steps else steps
 
-    def plan(self, given: Mapping[str, Sequence[Work]], now: float) -> Iterator[Move]:
+    def plan(self, given: Mapping[str, Sequence[ScoringJob]], now: float) -> Iterator[Move]:
         """Moves to the idle slots, the fastest member first; `given` is the work that is about to be sent.
 
         R17: an idle slot helps with what other workers hold, so the last jobs of a generation end sooner.
@@ -200,7 +200,7 @@ class SpeculativeExecution:
         and so has a job that is to show whether its holder can score.
         """
         job = self._jobs.get(digest)
-        if job is None or job.is_suspect or job.is_proof:
+        if job is None or job.is_suspect or job.is_control:
             return False
         if job.check is not None and not job.check.may_ask(host_of(taker.identity), taker.host_class):
             return False

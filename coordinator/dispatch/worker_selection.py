@@ -16,7 +16,7 @@ from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob, PendingJobs
 from dreamfleet.coordinator.jobs.checks import Check
-from dreamfleet.coordinator.jobs.work import Work
+from dreamfleet.coordinator.jobs.scoring_job import ScoringJob
 
 PEER_RATIO = 1.5  # workers at most this many times slower than the best share jobs evenly with it
 REST_FRACTION = 0.8  # a slower worker must return a job within this part of the time that the rest takes
@@ -162,7 +162,7 @@ class JobAssignment:
         self, jobs: PendingJobs, members: Mapping[str, Member], working_hosts: Collection[str],
         for_suspects: Collection[str],
     ) -> None:  # fmt: skip
-        self.given: dict[str, list[Work]] = {}
+        self.given: dict[str, list[ScoringJob]] = {}
         self.shares = {name: member.held_share for name, member in members.items() if member.credit > 0}
         self._full_at = {name: share + members[name].credit for name, share in self.shares.items()}
         self._idle = {name for name, share in self.shares.items() if share < members[name].capacity}
@@ -231,8 +231,8 @@ class JobAssignment:
         R8: a suspect goes to hosts that have scored, if any, and to no worker that holds another. A job that was scored
         before goes to hosts that have not scored, if one is here: it is to show whether they can. No job goes to a
         worker where it failed, unless every present one is such: then to those where it failed least often. A process
-        that was killed once must not stop the run. A stranger's hello cannot keep a failed job from being tried again,
-        and neither can a worker that was never ready, so guests and these do not count.
+        that was killed once must not stop the run. An unknown sender's hello cannot keep a failed job from being tried
+        again, and neither can a worker that was never ready, so unconfirmed workers and these do not count.
         """
         free: Collection[str] = self.shares
         allowed = self._allowed_members(pending)
@@ -253,7 +253,7 @@ class JobAssignment:
     def _allowed_members(self, pending: PendingJob) -> Mapping[str, Member]:
         if pending.is_suspect and self._for_suspects:
             return {name: each for name, each in self._members.items() if host_of(name) in self._for_suspects}
-        if pending.is_proof:
+        if pending.is_control:
             new = {name: each for name, each in self._members.items() if host_of(name) not in self._working_hosts}
             return new if any(each.takes_jobs for each in new.values()) else self._members
         return self._members
@@ -262,7 +262,7 @@ class JobAssignment:
 def assign_jobs(
     jobs: PendingJobs, members: Mapping[str, Member], working_hosts: Collection[str], for_suspects: Collection[str],
     now: float, *, drain_background: bool,
-) -> dict[str, list[Work]]:  # fmt: skip
+) -> dict[str, list[ScoringJob]]:  # fmt: skip
     """Take queued jobs one by one and choose a member with credit for each; the work by member.
 
     `working_hosts` and `for_suspects` are those of a `JobAssignment`. With `drain_background` background jobs may use
@@ -287,13 +287,13 @@ def assign_jobs(
             continue
         awaited = drain_background and pending.is_background
         name = selection.pick_for_background(eligible) if awaited else selection.pick(eligible)
-        if name is None and eligible is shares and not pending.is_proof:  # else the faster one may not be given it
+        if name is None and eligible is shares and not pending.is_control:  # else the faster one may not be given it
             passed_over.append(digest)
             break  # the jobs after it wait for a faster worker too
         name = name or min(eligible, key=lambda name: shares[name])
         selection.assign(name)
         assignment.give(digest, name, by_share=by_share)
-        if jobs.is_drawn(pending.work) and not pending.is_suspect and not pending.is_proof:
+        if jobs.is_drawn(pending.work) and not pending.is_suspect and not pending.is_control:
             assignment.give_copy(digest, name)
     for digest in passed_over:
         jobs.enqueue(digest)

@@ -1,7 +1,7 @@
 """What a run scores: generations, evaluations, confirmations and kept rollouts, as jobs. Pure."""
 
 __all__ = [
-    "work",
+    "scoring_job",
     "generation",
     "evaluation",
     "confirmation",

@@ -63,20 +63,20 @@ class Decision:
     ask_other: bool = False
     ask_again: frozenset[str] = frozenset()  # these hosts
     held: frozenset[str] = frozenset()
-    by_anchor: bool = False  # whether the word of an anchor alone says who is wrong
+    by_trusted: bool = False  # whether the word of a trusted host alone says who is wrong
 
 
 def decide(
-    answers: Sequence[Answer], present: Collection[str], others: bool, anchors: Collection[str]
+    answers: Sequence[Answer], present: Collection[str], others: bool, trusted: Collection[str]
 ) -> Decision:  # fmt: skip
     """What the answers of hosts of one class to one job prove.
 
     `present` are the hosts that could answer again, `others` says whether one is here that has not answered, and
-    `anchors` are the hosts whose word decides against a single other host.
+    `trusted` are the hosts whose word decides against a single other host.
 
     R32: a value is right if two hosts gave it and fewer gave any other; who ever gave another one is wrong. Without
     such a value another host answers. Without another host, each answers once more: who contradicts itself is wrong,
-    if another does not. Of two that stay with their words, an anchor is believed. Else both wait for a third host.
+    if another does not. Of two that stay with their words, a trusted host is believed. Else both wait for a third host.
     """
     values = defaultdict(set)
     for each in answers:
@@ -91,16 +91,16 @@ def decide(
         return Decision(ask_other=True)
     if once := {host for host in hosts if sum(each.host == host for each in answers) < 2} & set(present):
         return Decision(ask_again=frozenset(once))
-    return _decide_between({host: {each.value for each in answers if each.host == host} for host in hosts}, anchors)
+    return _decide_between({host: {each.value for each in answers if each.host == host} for host in hosts}, trusted)
 
 
-def _decide_between(values: dict[str, set[tuple[float, int, tuple[float, ...]]]], anchors: Collection[str]) -> Decision:
+def _decide_between(values: dict[str, set[tuple[float, int, tuple[float, ...]]]], trusted: Collection[str]) -> Decision:
     """The decision where nobody else can be asked, from each host's own values."""
     steady = frozenset(host for host, own in values.items() if len(own) == 1)
     unsteady = frozenset(values) - steady
     if len(steady) < 2:
         return Decision(unsteady) if steady else Decision()
-    anchored = steady & frozenset(anchors)
-    if len(values) == 2 and len(anchored) == 1:
-        return Decision(steady - anchored, by_anchor=True)
+    believed = steady & frozenset(trusted)
+    if len(values) == 2 and len(believed) == 1:
+        return Decision(steady - believed, by_trusted=True)
     return Decision(held=frozenset(values))

@@ -21,10 +21,10 @@ from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.records import StoredConfirmation
 from dreamfleet.common.runs.seeds import CHOOSING_OFFSET, CONFIRMING_OFFSET, validation_seeds
 from dreamfleet.common.runs.standard_error import sample_std
-from dreamfleet.coordinator.jobs.work import Work, make_work
+from dreamfleet.coordinator.jobs.scoring_job import ScoringJob, make_jobs
 
 FINALISTS = 4
-FindScores = Callable[[list[Work]], Mapping[bytes, float]]
+FindScores = Callable[[list[ScoringJob]], Mapping[bytes, float]]
 """Finds the known scores of jobs, by digest; NaN for an episode that failed for good."""
 
 
@@ -64,7 +64,7 @@ class Confirmation:
         self._closed = closed
         self._remaining = list(finalists)
         self._next = CHOOSING_OFFSET  # the first track of the next choosing round
-        self._work: list[Work] = []  # of the open round, finalist by finalist
+        self._work: list[ScoringJob] = []  # of the open round, finalist by finalist
         self._digests: list[bytes] = []  # of its jobs
         self._scores: dict[bytes, float] = {}
 
@@ -95,19 +95,21 @@ class Confirmation:
         """Whether scores of the open round are missing."""
         return len(self._scores) < len(self._digests)
 
-    def retry_failed(self) -> list[Work]:
+    def retry_failed(self) -> list[ScoringJob]:
         """Want the failed episodes of the open round again; their jobs."""
         failed = {digest for digest, score in self._scores.items() if isnan(score)}
         for digest in failed:
             del self._scores[digest]
         return [each for each in self._work if each.digest in failed]
 
-    def advance(self, known: FindScores, is_checking: Callable[[Sequence[Work]], bool] = lambda _: False) -> list[Work]:
+    def advance(
+        self, known: FindScores, is_checking: Callable[[Sequence[ScoringJob]], bool] = lambda _: False
+    ) -> list[ScoringJob]:
         """Close a complete round and open the next one; return its missing jobs, none once there is an outcome.
 
         `is_checking` says of a round's jobs whether known results of them wait for a check. Such a round stays open.
         """
-        missing: list[Work] = []
+        missing: list[ScoringJob] = []
         while not self._is_over and not missing:
             if self._digests:
                 self._close()
@@ -126,7 +128,7 @@ class Confirmation:
         if digest in self._digests:
             self._scores[digest] = score
 
-    def _open(self, known: FindScores) -> list[Work]:
+    def _open(self, known: FindScores) -> list[ScoringJob]:
         first, count = CONFIRMING_OFFSET, self._episodes
         if len(self._remaining) > 1:
             first, count = self._next, max(1, self._episodes // len(self._remaining))
@@ -135,7 +137,7 @@ class Confirmation:
         work = [
             job
             for each in self._remaining
-            for job in make_work(self._spec, "evaluate", each.generation, 0, each.vector, seeds, first=first)
+            for job in make_jobs(self._spec, "evaluate", each.generation, 0, each.vector, seeds, first=first)
         ]
         self._work = work
         self._digests = [each.digest for each in work]

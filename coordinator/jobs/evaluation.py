@@ -16,7 +16,7 @@ from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.paired_difference import is_clearly_below
 from dreamfleet.common.runs.records import StoredEvaluation
 from dreamfleet.common.runs.seeds import validation_seeds
-from dreamfleet.coordinator.jobs.work import Work, make_work
+from dreamfleet.coordinator.jobs.scoring_job import ScoringJob, make_jobs
 
 FindScores = Callable[[int], Mapping[int, float]]
 """Finds the scores of a finished evaluation by seed, from its generation; a seed without a score is missing."""
@@ -30,9 +30,9 @@ class Evaluation:
     vector: bytes
     episodes: int
 
-    def work(self, spec: TaskSpec) -> list[Work]:
+    def work(self, spec: TaskSpec) -> list[ScoringJob]:
         """The jobs of this evaluation."""
-        return make_work(spec, "evaluate", self.generation, 0, self.vector, validation_seeds(self.episodes))
+        return make_jobs(spec, "evaluate", self.generation, 0, self.vector, validation_seeds(self.episodes))
 
 
 @dataclass
@@ -82,7 +82,7 @@ class Evaluations:
             best = self._bests[-1] if self._bests else row
             self._bests.append(row if row.rank > best.rank else best)
 
-    def open(self, evaluation: Evaluation, spec: TaskSpec, known: Mapping[bytes, float]) -> list[Work]:
+    def open(self, evaluation: Evaluation, spec: TaskSpec, known: Mapping[bytes, float]) -> list[ScoringJob]:
         """Open an evaluation with the scores that are known already; return its missing jobs."""
         work = evaluation.work(spec)
         digests = [each.digest for each in work]
@@ -101,7 +101,7 @@ class Evaluations:
             self._open[generation].scores[digest] = score
         return waiting
 
-    def retry_failed(self, spec: TaskSpec) -> list[Work]:
+    def retry_failed(self, spec: TaskSpec) -> list[ScoringJob]:
         """Want the failed episodes of the open evaluations again; their jobs, each once."""
         work = {}
         for each in self._open.values():

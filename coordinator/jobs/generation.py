@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.result_bounds import to_finite
-from dreamfleet.coordinator.jobs.work import Work, make_work
+from dreamfleet.coordinator.jobs.scoring_job import ScoringJob, make_jobs
 
 KnownResult = tuple[float, int, tuple[float, ...]]
 """Fitness, steps and measures of an episode, NaN for one that failed for good."""
@@ -51,7 +51,7 @@ class Generation:
         self.spec = spec
         distinct = len(set(vectors))
         self.is_one_point = distinct == 1 < len(vectors)  # compared as float32: nothing can be learned from equal ones
-        self.work: list[Work] = []
+        self.work: list[ScoringJob] = []
         self._vectors = vectors
         self._parts = (spec.with_overrides(driven=True), seeds[:driven], 0), (spec, seeds[driven:], driven)
         self._run_spec = run_spec or spec
@@ -77,7 +77,7 @@ class Generation:
         """How many wanted jobs are not made yet."""
         return int(self._wanted[self._made :].sum())
 
-    def make_more(self) -> list[Work]:
+    def make_more(self) -> list[ScoringJob]:
         """Make the jobs of further candidates, some `PART_JOBS`; those that are wanted."""
         made = len(self.work)
         self._make(self._made + max(1, PART_JOBS // max(self.episodes, 1)))
@@ -87,7 +87,7 @@ class Generation:
     def _make(self, until: int) -> None:
         for candidate, vector in enumerate(self._vectors[self._made : until], self._made):
             for spec, seeds, first in self._parts:
-                for work in make_work(spec, "score", self.number, candidate, vector, seeds, self._run_spec, first):
+                for work in make_jobs(spec, "score", self.number, candidate, vector, seeds, self._run_spec, first):
                     self.work.append(work)
                     places = self._places.setdefault(work.digest, [])
                     places.append((candidate, work.episode))
@@ -116,7 +116,7 @@ class Generation:
         """How many episodes each candidate has."""
         return self._scores.shape[1]
 
-    def find_scored(self) -> Work | None:
+    def find_scored(self) -> ScoringJob | None:
         """A job that has a score; `None` if there is none."""
         return next(
             (each for each in self.work if np.isfinite(self._scores[each.template.candidate, each.episode])), None
@@ -149,7 +149,7 @@ class Generation:
         return bool(whole.any() and self._failed[whole].all())
 
     @property
-    def missing(self) -> list[Work]:
+    def missing(self) -> list[ScoringJob]:
         """Wanted jobs without a result, of those that are made, each digest once, candidate by candidate."""
         first = {work.digest: work for work in reversed(self.work)}
         is_open = self._open_places.tolist()
@@ -166,7 +166,7 @@ class Generation:
         return [digest for digest, places in self._places.items() if all(failed[row] for row, _ in places)]
 
     @property
-    def counted(self) -> list[Work]:
+    def counted(self) -> list[ScoringJob]:
         """Jobs whose results count now."""
         scored = (self._counting & np.isfinite(self._scores)).tolist()
         return [each for each in self.work if scored[each.template.candidate][each.episode]]
@@ -214,7 +214,7 @@ class Generation:
         self._failed |= self._open_places.any(axis=1)
 
     def recall(self, results: Mapping[bytes, KnownResult]) -> None:
-        """Record results of an earlier life by digest."""
+        """Record results of an earlier incarnation by digest."""
         for digest in self._places:
             if digest in results:
                 self.record(digest, *results[digest])

@@ -15,8 +15,8 @@ from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import Result, TaskSpec
 from dreamfleet.common.runs.run_paths import rollout_path
 from dreamfleet.common.runs.seeds import collection_seed
+from dreamfleet.coordinator.jobs.scoring_job import ScoringJob, make_jobs
 from dreamfleet.coordinator.jobs.upload_assembler import UploadAssembler
-from dreamfleet.coordinator.jobs.work import Work, make_work
 
 NOT_KEPT = Failure("the rollout was not kept: update dreamfleet on this host", "the rollout was not kept")
 
@@ -29,10 +29,10 @@ class RolloutCollection:
     vector: bytes
     episodes: int
 
-    def work(self, spec: TaskSpec, run_seed: int, run_spec: TaskSpec | None = None) -> list[Work]:
+    def work(self, spec: TaskSpec, run_seed: int, run_spec: TaskSpec | None = None) -> list[ScoringJob]:
         """The jobs of this collection; `run_spec` is the run's specification if `spec` differs from it."""
         seeds = [collection_seed(run_seed, self.generation, episode) for episode in range(self.episodes)]
-        return make_work(spec, "collect", self.generation, 0, self.vector, seeds, run_spec)
+        return make_jobs(spec, "collect", self.generation, 0, self.vector, seeds, run_spec)
 
 
 class RolloutCollections:
@@ -44,7 +44,7 @@ class RolloutCollections:
         self._missing: set[bytes] = set()  # digests
         self._scheduled = 0  # rollouts of the whole run
 
-    def open(self, work: list[Work], known: Container[bytes]) -> list[Work]:
+    def open(self, work: list[ScoringJob], known: Container[bytes]) -> list[ScoringJob]:
         """Want these rollouts; return the jobs of those that are not kept already."""
         missing = [each for each in work if each.digest not in known]
         self._scheduled += len(work)
@@ -71,7 +71,7 @@ class RolloutCollections:
         """Rollouts of the whole run: kept, wanted."""
         return self._scheduled - len(self._missing), self._scheduled
 
-    def receive(self, worker: str, result: Result, work: Work | None) -> Result | None:
+    def receive(self, worker: str, result: Result, work: ScoringJob | None) -> Result | None:
         """The result to judge, with its rollout saved; `None` while the rollout is on its way.
 
         R6: the rollout is on disk before the result can get a verdict, so a crash loses no rollout.

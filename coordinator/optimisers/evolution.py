@@ -63,7 +63,7 @@ class Evolution:
             parse_options([*settings.optimiser_options, *covariance]),
             parse_axes(settings.archive),
         )
-        space = None if subspace is None or stage.whole else SearchSpace(subspace, settings.controller)
+        space = None if subspace is None or stage.all_parameters else SearchSpace(subspace, settings.controller)
         return cls(settings.optimiser, search, space)
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dreamfleet.common.protocol.host_classes import effective_class
 from dreamfleet.common.protocol.messages import HelloRequest
 from dreamfleet.common.runs.records import RunSettings
-from dreamfleet.common.security.anchor_key import is_proof
+from dreamfleet.common.security.host_key import is_token_of
 from dreamfleet.coordinator.dispatch.event_log import Note
 from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.dispatch.fleet import Fleet
@@ -22,7 +22,7 @@ class WorkerAdmission:
     """Admits workers to a run's fleet and removes those of a foreign class; only a `strict` run has foreign classes."""
 
     def __init__(
-        self, journal: Journal, settings: RunSettings, fleet: Fleet, *, strict: bool, anchor_key: bytes = b""
+        self, journal: Journal, settings: RunSettings, fleet: Fleet, *, strict: bool, host_key: bytes = b""
     ) -> None:
         self.strict = strict
         self.refused_workers = RefusedWorkers()
@@ -32,7 +32,7 @@ class WorkerAdmission:
         self._journal = journal
         self._settings = settings
         self._fleet = fleet
-        self._anchor_key = anchor_key
+        self._host_key = host_key
 
     def find_refusal(self, request: HelloRequest) -> Refusal | None:
         """Why a worker cannot join; `None` if it may."""
@@ -55,7 +55,7 @@ class WorkerAdmission:
         numbering = self._fleet.add_worker(request.worker, request.slots, request.fingerprint, now)
         if (member := self._fleet.members[request.worker]) is not known:
             member.host_class = self.class_of(request.host_class, request.fingerprint)
-            member.is_anchor = is_proof(self._anchor_key, request.worker, request.anchor)
+            member.is_trusted = is_token_of(self._host_key, request.worker, request.host_token)
         return numbering
 
     def update_class(self, worker: str, host_class: str) -> None:

@@ -15,7 +15,7 @@ from dreamfleet.coordinator.jobs.confirmation import FINALISTS, Confirmation, to
 from dreamfleet.coordinator.jobs.evaluation import Evaluation, Evaluations
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollection, RolloutCollections
-from dreamfleet.coordinator.jobs.work import Work
+from dreamfleet.coordinator.jobs.scoring_job import ScoringJob
 from dreamfleet.coordinator.run.report import ControllerWriter
 from dreamfleet.coordinator.run.verification import Verification
 from dreamfleet.coordinator.settings.run_provenance import build_provenance
@@ -56,7 +56,7 @@ class BackgroundJobs:
         confirming = self._confirmation is not None and self._confirmation.in_progress
         return bool(self.evaluations.open_count or self.rollout_collections.missing_count or confirming)
 
-    def retry_failed(self) -> list[Work]:
+    def retry_failed(self) -> list[ScoringJob]:
         """Forget the failed episodes of what is open, in the journal too; their jobs."""
         work = self.evaluations.retry_failed(self._settings.task)
         if self._confirmation is not None:
@@ -100,7 +100,7 @@ class BackgroundJobs:
         """The confirmation's open round, in words."""
         return "" if self._confirmation is None else self._confirmation.round_description
 
-    def begin(self, mean: bytes, now: float) -> list[Work]:
+    def begin(self, mean: bytes, now: float) -> list[ScoringJob]:
         """Restore the report of the last incarnation; the jobs that are still missing."""
         if (last := self._history.last) is not None:
             self.report.generation_closed(last.number, mean, self._history.steps, now)
@@ -114,7 +114,7 @@ class BackgroundJobs:
         ]
         return evaluations + [each for item in self._journal.scheduled_collections() for each in self._collect(item)]
 
-    def schedule(self, generation: int, mean: bytes, now: float, *, last: bool) -> list[Work]:
+    def schedule(self, generation: int, mean: bytes, now: float, *, last: bool) -> list[ScoringJob]:
         """The jobs that are due after a closed generation; after the `last` one all are."""
         settings, work = self._settings, []
         self.report.generation_closed(generation, mean, self._history.steps, now)
@@ -138,7 +138,7 @@ class BackgroundJobs:
         if self._confirmation is not None:
             self._confirmation.record(job.digest, fitness)
 
-    def confirm(self) -> list[Work]:
+    def confirm(self) -> list[ScoringJob]:
         """The next jobs that confirm the reported mean; call it when a limit is reached and nothing is in progress.
 
         Empty once the mean is confirmed, or if nothing was evaluated; also while only checks are missing.
@@ -160,8 +160,8 @@ class BackgroundJobs:
             self.report.set_judged(outcome, self._journal.evaluated_vector(outcome.generation), self._history.steps)
         return work
 
-    def _check_again(self, work: Sequence[Work]) -> bool:
-        """Check what an earlier life accepted of these jobs and did not check; whether any waits for its check."""
+    def _check_again(self, work: Sequence[ScoringJob]) -> bool:
+        """Check what an earlier incarnation accepted of these jobs unchecked; whether any waits for its check."""
         self._verification.restore(work)
         return self._verification.is_checking(each.digest for each in work)
 
@@ -177,7 +177,7 @@ class BackgroundJobs:
         scores = {each.job.seeds[0]: known.get(each.digest, nan) for each in work}
         return {seed: score for seed, score in scores.items() if not isnan(score)}
 
-    def _evaluate(self, evaluation: Evaluation) -> list[Work]:
+    def _evaluate(self, evaluation: Evaluation) -> list[ScoringJob]:
         wanted = evaluation.work(self._settings.task)
         work = self.evaluations.open(evaluation, self._settings.task, self._journal.fitness_of("evaluate", wanted))
         self._verification.restore(wanted)
@@ -199,7 +199,7 @@ class BackgroundJobs:
         if found.found is not None and self.evaluations.best is found.found:
             self.report.set_judged(found.found, found.vector, self._history.steps)
 
-    def _collect(self, collection: RolloutCollection) -> list[Work]:
+    def _collect(self, collection: RolloutCollection) -> list[ScoringJob]:
         known = self._journal.results.of("collect", collection.generation)
         spec, settings = self._agenda.stage_of(collection.generation).stage.settings.task, self._settings
         return self.rollout_collections.open(collection.work(spec, settings.seed, settings.task), known)

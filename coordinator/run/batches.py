@@ -56,7 +56,7 @@ class Batches:
         self._journal = run.journal
         self._name = name
         self._uploads = UploadAssembler()
-        self._remarked = False  # on test seeds: once in a coordinator's life
+        self._remarked = False  # on test seeds: once in a coordinator's incarnation
         self._announced: tuple[str, int] | None = None  # the open batch's id and its candidates that were done
         self._durable: Generation | None = None  # the open generation as the journal has it
 

@@ -77,17 +77,17 @@ class FailurePolicy:
         First a host that has not scored gets a job that was scored before, to show whether it can.
         """
         judge, jobs = self._fleet.failure_judge, self._fleet.jobs
-        judge.lacks_proof = False
+        judge.lacks_control_job = False
         broken = judge.find_broken_fleet(at_once=self.share < 1) if self.judges else None
         if not self.judges and (failure := judge.find_pausing()) is not None:
             return Pause(PauseKind.FAILED_JOB, f"{failure.describe_failure()}; `dreamfleet resume` tries it again")
-        if broken is None and not judge.awaits_proof:
+        if broken is None and not judge.awaits_control_job:
             return None
-        proof = self._generations.find_scored(generation)
+        control = self._generations.find_scored(generation)
         if broken is None:
-            judge.lacks_proof = proof is None or not jobs.offer_proof(proof)
-        elif proof is None or judge.has_failed_proof or not jobs.offer_proof(proof):
-            return self._no_able_host(broken, has_score=proof is not None)
+            judge.lacks_control_job = control is None or not jobs.offer_control_job(control)
+        elif control is None or judge.has_failed_control_job or not jobs.offer_control_job(control):
+            return self._no_able_host(broken, has_score=control is not None)
         return None
 
     def _no_able_host(self, failure: PendingJob, *, has_score: bool) -> Pause:

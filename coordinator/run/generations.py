@@ -15,7 +15,7 @@ from dreamfleet.common.runs.seeds import MAX_RESEEDS, count_reseeds, training_se
 from dreamfleet.common.runs.stages import BegunStage, Stage, StageTracker, stages_of
 from dreamfleet.coordinator.jobs.generation import CandidateScores, Generation
 from dreamfleet.coordinator.jobs.history import History
-from dreamfleet.coordinator.jobs.work import Work, vector_bytes
+from dreamfleet.coordinator.jobs.scoring_job import ScoringJob, vector_bytes
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
 from dreamfleet.coordinator.optimisers.evolution import Evolution
 from dreamfleet.coordinator.settings.start import SUBSPACE_FACT, stored_start_mean, stored_subspace
@@ -39,7 +39,7 @@ class Generations:
         self.seconds = 0.0  # for which the restored generation could be scored before
         self._rounds = 0  # in which candidates were drawn anew
         self._reseeds = 0  # times that the open generation got other seeds
-        self._scored_before: Work | None = None  # a job of the last generation that has a score
+        self._scored_before: ScoringJob | None = None  # a job of the last generation that has a score
         self._journal = journal
         self._settings = settings
         self._agenda = agenda
@@ -223,7 +223,7 @@ class Generations:
         opened = len(self.redrawn.union(generation.failed)) if counted else 0
         return sum(each.failed for each in self.history.rows[first:]) + opened, counted
 
-    def find_scored(self, generation: Generation) -> Work | None:
+    def find_scored(self, generation: Generation) -> ScoringJob | None:
         """A job of the open generation or the last one that has a score; `None` if there is none."""
         return generation.find_scored() or self._scored_before
 

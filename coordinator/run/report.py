@@ -103,7 +103,7 @@ class ControllerWriter:
         self._saved, self._due = self.current, False
 
     def withdraw(self) -> None:
-        """Remove the file, durably, before a recall is committed: until the next life writes it, there is none."""
+        """Remove the file, durably, before a recall is committed: the next incarnation writes it again."""
         withdraw_controller(self._path)
         self._saved = None
 
@@ -112,7 +112,7 @@ def withdraw_controller(path: Path) -> None:
     """Remove a run's reported controller, durably; `JournalError` where the disk refuses.
 
     This comes before what it follows from is taken back in the journal. So a kill in between leaves a run without the
-    file, which its next life writes again, and never a file that claims what counts no more.
+    file, which its next incarnation writes again, and never a file that claims what counts no more.
     """
     try:
         path.unlink()

@@ -25,7 +25,7 @@ from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.history import History
-from dreamfleet.coordinator.jobs.work import Work
+from dreamfleet.coordinator.jobs.scoring_job import ScoringJob
 from dreamfleet.coordinator.run.admission import WorkerAdmission
 from dreamfleet.coordinator.run.background_jobs import BackgroundJobs
 from dreamfleet.coordinator.run.external_generations import ExternalGenerations
@@ -50,9 +50,9 @@ class Run:
 
     def __init__(
         self, journal: Journal, settings: RunSettings, limits: LimitsConfig, network: NetworkConfig, now: float,
-        anchor_key: bytes = b"",
+        host_key: bytes = b"",
     ) -> None:  # fmt: skip
-        """`anchor_key` is the key of this host, by which workers on it show that they are (R32)."""
+        """`host_key` is the key of this host, by which workers on it show that they are (R32)."""
         self.journal = journal  # whose only writer is the thread of this run
         self.settings = settings
         self.limits = limits
@@ -66,7 +66,7 @@ class Run:
         self.incarnation = journal.begin_incarnation()
         journal.commit()
         self._notes: list[Note] = []  # that are in the journal and not in the log
-        self.admission = WorkerAdmission(journal, settings, self.fleet, strict=network.strict, anchor_key=anchor_key)
+        self.admission = WorkerAdmission(journal, settings, self.fleet, strict=network.strict, host_key=host_key)
         self.verification = Verification(journal, self.fleet, self.admission, network.verify, self.incarnation)
         reached = stored_reason(journal, limits)
         self.state: RunState = Running() if reached is None else Running().reach_limit(reached)
@@ -84,7 +84,7 @@ class Run:
         self.open_seconds = self.generations.seconds  # in which the open generation could be scored
         self.fleet.failure_judge.working_hosts.update(map(host_of, journal.results.workers()))
         if self.incarnation > 1:  # the last incarnation may have sent the next generation's jobs before it was durable
-            self.fleet.jobs.previous_epoch_until = self.generation.number + 1
+            self.fleet.jobs.given_before_until = self.generation.number + 1
         self._begin(now)
 
     @property
@@ -96,7 +96,7 @@ class Run:
         """The only place where the state changes."""
         self.state, self.fleet.paused = state, not state.gives_jobs
 
-    def record_result(self, work: Work, result: Result, worker: str, fingerprint: str, host_class: str) -> None:
+    def record_result(self, work: ScoringJob, result: Result, worker: str, fingerprint: str, host_class: str) -> None:
         """Journal an accepted result, then count it for the generation or the background job that wants it."""
         self.journal.results.add(work.job, result, worker, fingerprint, self.incarnation, host_class)
         self.admission.adopt_class(host_class, fingerprint)
@@ -272,7 +272,7 @@ class Run:
         """Bar hosts and take back what they brought, in one transaction (R33); whether that is durable.
 
         If it is not, nothing of it was written, nor what came since the last commit. What the run holds in memory is
-        true no more in either case: another life goes on from the journal.
+        true no more in either case: another incarnation goes on from the journal.
         """
         self.journal.verify(self.journal.path.parent)  # else what somebody wrote into it would be replayed, and sealed
         self._enter(self.state.rewind())
@@ -410,7 +410,7 @@ class Run:
         if work := self.background_jobs.confirm():
             self.fleet.note(self.background_jobs.round_description, "confirming")
             self.fleet.jobs.offer(work)
-        elif not self.fleet.jobs.checks:  # else results of an earlier life are checked first
+        elif not self.fleet.jobs.checks:  # else results of an earlier incarnation are checked first
             if self.background_jobs.confirmation_failed:
                 self.fleet.note("no confirmed score: every episode of the confirmation failed", "unconfirmed")
             self._end()

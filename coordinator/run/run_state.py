@@ -59,7 +59,7 @@ class RunState:
         return self._refuse("end")
 
     def rewind(self) -> RunState:
-        """Leave the run to the next life of the coordinator, which goes on from an earlier point of the journal."""
+        """Leave the run to the next incarnation, which goes on from an earlier point of the journal."""
         match self:
             case Running() | Ending() | Paused() | Ended():
                 return Rewound()
@@ -90,12 +90,12 @@ class RunState:
 
     @property
     def is_over(self) -> bool:
-        """Whether this life does nothing more for the run but to write what it has."""
+        """Whether this incarnation does nothing more for the run but to write what it has."""
         return isinstance(self.settled, Ended | Rewound)
 
     @property
     def is_rewound(self) -> bool:
-        """Whether the next life of the coordinator goes on from an earlier point of the journal."""
+        """Whether the next incarnation goes on from an earlier point of the journal."""
         return isinstance(self.settled, Rewound)
 
     @property

@@ -20,7 +20,7 @@ from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob
 from dreamfleet.coordinator.jobs.checks import Answer, Check, Decision, decide
-from dreamfleet.coordinator.jobs.work import Work
+from dreamfleet.coordinator.jobs.scoring_job import ScoringJob
 from dreamfleet.coordinator.run.admission import WorkerAdmission
 from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.coordinator.storage.verification_records import Outcome, StoredBar
@@ -62,7 +62,7 @@ class Verification:
             self._key = journal.verification.key()
             fleet.jobs.is_drawn = self.is_drawn
 
-    def is_drawn(self, work: Work) -> bool:
+    def is_drawn(self, work: ScoringJob) -> bool:
         """Whether a job's accepted result is to be checked. Kept rollouts are not: no fitness depends on them."""
         if not self.share or work.kind == "collect":
             return False
@@ -105,8 +105,8 @@ class Verification:
             self._answers[job.digest] = [Answer.of(host_of(worker), result)]
             self._workers[job.digest] = worker
 
-    def restore(self, work: Iterable[Work]) -> None:
-        """Check again what an earlier life of the coordinator accepted and did not check."""
+    def restore(self, work: Iterable[ScoringJob]) -> None:
+        """Check again what an earlier incarnation of the coordinator accepted and did not check."""
         if not self.share:
             return
         drawn = {each.digest: each for each in work if each.digest not in self._jobs and self.is_drawn(each)}
@@ -114,13 +114,13 @@ class Verification:
             self._jobs.offer_check(drawn[digest], Check(known.host_class, {known.answer.host}))
             self._answers[digest], self._workers[digest] = [known.answer], known.worker
 
-    def keep_to(self, counted: Iterable[Work]) -> None:
+    def keep_to(self, counted: Iterable[ScoringJob]) -> None:
         """Check no candidate's result but those of these jobs: others count no more."""
         digests = {each.digest for each in counted}
         checked = [(digest, each.work.kind) for digest, each in self._jobs.checks.items()]
         self._fleet.leases.withdraw(digest for digest, kind in checked if kind == "score" and digest not in digests)
 
-    def record(self, work: Work, result: Result, worker: str) -> None:
+    def record(self, work: ScoringJob, result: Result, worker: str) -> None:
         """Compare a result of a job whose result was accepted before; a repeated message changes nothing."""
         answers, answer = self._answers[work.digest], Answer.of(host_of(worker), result)
         if answer not in answers and work.digest not in self._findings:
@@ -187,12 +187,14 @@ class Verification:
         able = [each for each in self._scoring_members() if each.host_class == check.host_class]
         present = {host_of(each.identity) for each in able} - check.passed_over
         answered = {each.host for each in answers}
-        anchors = {host_of(each.identity) for each in self._fleet.members.values() if each.is_anchor}
-        decision = decide(answers, present, bool(present - answered), anchors)
+        trusted = {host_of(each.identity) for each in self._fleet.members.values() if each.is_trusted}
+        decision = decide(answers, present, bool(present - answered), trusted)
         if decision.ask_other or decision.ask_again:
             only = decision.ask_again or None
             self._fleet.leases.check_again(pending, Check(check.host_class, answered, check.passed_over, only))
-        elif decision.held or (decision.by_anchor and any(each.by_anchor for each in self._admission.barred.values())):
+        elif decision.held or (
+            decision.by_trusted and any(each.by_trusted for each in self._admission.barred.values())
+        ):
             self._hold(pending, answered)
         else:
             self._finish(pending, decision)
@@ -240,10 +242,10 @@ class Verification:
         for found in self._findings.values():
             self._write(found)
             for host in sorted(found.decision.wrong):
-                by_anchor = found.decision.by_anchor
-                witness = "the coordinator's own host" if by_anchor else "another host"
+                by_trusted = found.decision.by_trusted
+                witness = "the coordinator's own host" if by_trusted else "another host"
                 why = f"{found.what}; {witness} confirms that {printable(host)} is wrong"
-                hosts |= self._admission.bar(host, StoredBar(why, by_anchor), self._incarnation)
+                hosts |= self._admission.bar(host, StoredBar(why, by_trusted), self._incarnation)
         self._findings.clear()
         return hosts
 

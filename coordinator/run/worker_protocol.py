@@ -31,7 +31,7 @@ from dreamfleet.common.schema.validation import MAX_TEXT, to_plain
 from dreamfleet.coordinator.dispatch.failures import LONGEST_ERROR
 from dreamfleet.coordinator.dispatch.packing import SentBatch
 from dreamfleet.coordinator.dispatch.refusals import Refusal
-from dreamfleet.coordinator.jobs.work import Work
+from dreamfleet.coordinator.jobs.scoring_job import ScoringJob
 from dreamfleet.coordinator.run.run import Run
 
 WorkerMessage = ResultBatch | Heartbeat | UploadPart
@@ -84,7 +84,7 @@ class WorkerProtocol:
     def handle(self, worker: str, message: WorkerMessage, now: float) -> None:
         """Handle a worker's message; one for another run, or a heartbeat for another coordinator, is dropped."""
         if self._run.state.is_rewound:
-            return  # the next life of the coordinator hears it again
+            return  # the next incarnation of the coordinator hears it again
         if message.run_uid != self._run.uid:
             self._fleet.dropped["foreign run"] += 1
         elif isinstance(message, ResultBatch):
@@ -155,7 +155,7 @@ class WorkerProtocol:
         )
 
     def _handle_result(
-        self, worker: str, reported: Result, work: Work | None, fingerprint: str, host_class: str, now: float
+        self, worker: str, reported: Result, work: ScoringJob | None, fingerprint: str, host_class: str, now: float
     ) -> None:
         """Judge one result; `work` is the wanted job that it names, `None` if it names none."""
         bounded = fail_if_excessive(reported, self._horizon_of(work), self._measures)
@@ -177,7 +177,7 @@ class WorkerProtocol:
             self._run.verification.record(self._fleet.checked, result, worker)
         self._collections.uploads.forget(reported.digest)
 
-    def _horizon_of(self, work: Work | None) -> int:
+    def _horizon_of(self, work: ScoringJob | None) -> int:
         """The most steps of a job's episode; evaluations drive whole ones, whose length only the task knows."""
         if work is None or work.kind == "evaluate":
             return LONGEST_EPISODE

@@ -27,7 +27,7 @@ class QueueLimit:
 
 
 AT_ONCE, IN_A_SECOND = "too many at once", "too many in a second"  # reasons, which are counted
-HELLO_PATIENCE = 32  # events after which a waiting hello goes first
+HELLO_LIMIT = 32  # events after which a waiting hello goes first
 QUEUE_LIMITS = {
     "result": QueueLimit(2048, 16 << 20),
     "beat": QueueLimit(2048, 8 << 20),
@@ -80,7 +80,7 @@ class InboundQueue:
         """Take the oldest event; hellos wait for the others, but not forever. `queue.Empty` after `timeout` seconds."""
         self._wakeups.get(timeout=timeout)
         with self._lock:
-            hello = self._later and (not self._first or self._passed_over >= HELLO_PATIENCE)
+            hello = self._later and (not self._first or self._passed_over >= HELLO_LIMIT)
             waiting = self._later if hello else self._first
             self._passed_over = 0 if hello else self._passed_over + 1
             if not waiting:

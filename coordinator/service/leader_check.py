@@ -24,10 +24,10 @@ class OtherCoordinator:
 
 @dataclass
 class LeaderCheck:
-    """The other visible coordinators, by nonce; a silent one counts as live after `patience` seconds."""
+    """The other visible coordinators, by nonce; a silent one counts as live after `timeout` seconds."""
 
     own_nonce: str  # this coordinator's nonce
-    patience: float
+    timeout: float
     own_note: ClaimNote | None = None  # identifies this coordinator; `None` until it serves a run
     _seen: dict[str, OtherCoordinator] = field(default_factory=dict)
 
@@ -61,7 +61,7 @@ class LeaderCheck:
         """The live coordinators: each one's nonce and note, `None` if it does not answer."""
         return [
             (nonce, each.note) for nonce, each in self._seen.items()
-            if each.note is not None or now - each.since > self.patience
+            if each.note is not None or now - each.since > self.timeout
         ]  # fmt: skip
 
     def find_stronger(self, now: float) -> tuple[str, ClaimNote | None] | None:

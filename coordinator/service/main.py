@@ -24,9 +24,9 @@ from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_folder import EPISODE_LIMIT, open_run
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.runs.run_paths import ARCHIVE, BUNDLE, resume_command
-from dreamfleet.common.security.anchor_key import make_anchor_key
 from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, RevocationWatcher
 from dreamfleet.common.security.credentials import Credentials
+from dreamfleet.common.security.host_key import make_host_key
 from dreamfleet.common.transport.session import Network
 from dreamfleet.common.worlds.score_words import score_word
 from dreamfleet.coordinator.run.run import Run
@@ -92,7 +92,7 @@ class RunRequest:
 
 
 class Stop:
-    """Stops whichever life of the coordinator serves the run now. Safe in a signal handler."""
+    """Stops whichever incarnation of the coordinator serves the run now. Safe in a signal handler."""
 
     def __init__(self) -> None:
         self.is_requested = False
@@ -107,14 +107,14 @@ class Stop:
 def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], None] = lambda _stop: None) -> Run:
     """Serve a new or continued run until it ends or is stopped; `on_stoppable` receives the function that stops it.
 
-    After results were recalled, another life goes on from the journal, as after a kill (R33).
+    After results were recalled, another incarnation goes on from the journal, as after a kill (R33).
     """
     stop = Stop()
     on_stoppable(stop)
     with ExitStack() as lock:
         kept = _Kept(lock)
         while True:
-            run = _serve_life(request, stop, kept)
+            run = _serve_incarnation(request, stop, kept)
             if not run.state.is_rewound or stop.is_requested:
                 return run
             request = replace(request, config=None, start=None)
@@ -122,9 +122,9 @@ def serve_run(request: RunRequest, on_stoppable: Callable[[Callable[[], None]], 
 
 @dataclass
 class _Kept:
-    """What one life of the coordinator leaves to the next: the lock of the run's folder, and which seats are revoked.
+    """What one incarnation leaves to the next: the lock of the run's folder, and which seats are revoked.
 
-    Between two lives no other program may take the run, and the list of revoked seats may be missing for a while.
+    Between two incarnations no other program may take the run, and the list of revoked seats may be missing.
     """
 
     lock: ExitStack
@@ -132,7 +132,7 @@ class _Kept:
     revocations: RevocationWatcher | None = None
 
 
-def _serve_life(request: RunRequest, stop: Stop, kept: _Kept) -> Run:
+def _serve_incarnation(request: RunRequest, stop: Stop, kept: _Kept) -> Run:
     """Serve one incarnation of a run."""
     folder = request.folder
     if request.config is not None:
@@ -164,8 +164,8 @@ def _serve_life(request: RunRequest, stop: Stop, kept: _Kept) -> Run:
             stack.enter_context(closing(file_watch))
             if log_to:
                 stack.enter_context(add_on("live-log")(folder, log_to))
-            anchor_key = make_anchor_key() if request.network.verify else b""
-            run = Run(journal, settings, request.limits, request.network, monotonic(), anchor_key)
+            host_key = make_host_key() if request.network.verify else b""
+            run = Run(journal, settings, request.limits, request.network, monotonic(), host_key)
             return OpenRun(run, file_watch, served)
 
         word = score_word(settings.task.task) if bundle is None else bundle.manifest.facts.score_word

@@ -15,6 +15,7 @@ from typing import Any
 from dreamfleet.common.client.equal_fitness import EqualFitness
 from dreamfleet.common.client.run_view import LiveRunView
 from dreamfleet.common.client.status import Status
+from dreamfleet.common.host.logs import log_event
 from dreamfleet.common.host.reports import ADDRESS, report
 from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.protocol.tasks import is_function_task, is_unregistered
@@ -50,18 +51,19 @@ class RunLog:
     def begin(self) -> None:
         """The run is served from now on."""
         run, listen = self._run, self._network.listen
-        facts = {"event": "begin", "run": self._name, "run_uid": run.uid, "incarnation": run.incarnation}
-        log.info("incarnation %d begins with generation %d", run.incarnation, run.generation.number,
-                 extra={"facts": facts})  # fmt: skip
+        text = f"incarnation {run.incarnation} begins with generation {run.generation.number}"
+        log_event(log, "begin", text, run=self._name, run_uid=run.uid, incarnation=run.incarnation)
         if run.settings.confirm_episodes and not is_function_task(run.settings.task.task):
-            log.info("once its last generation is closed, %s or more confirm the best mean (--confirm-episodes)",
-                     plural(run.settings.confirm_episodes, "whole episode"))  # fmt: skip
+            episodes = plural(run.settings.confirm_episodes, "whole episode")
+            log.info(
+                "once its last generation is closed, %s or more confirm the best mean (--confirm-episodes)", episodes
+            )
         report(ADDRESS, listen or self._network.connect)
         if listen:
             log.info("listening on %s", ", ".join(listen))
             if self._network.credentials is None and not all(is_loopback(each) for each in listen):
-                log.warning("this is neither encrypted nor authenticated: anyone who reaches the port controls the run "
-                            "(docs/how-to/security.md)", extra={"facts": {"event": "insecure"}})  # fmt: skip
+                text = "this is neither encrypted nor authenticated: anyone who reaches the port controls the run"
+                log_event(log, "insecure", f"{text} (docs/how-to/security.md)", level=logging.WARNING)
 
     def report_closed(self, generations: Iterable[StoredGeneration]) -> None:
         """Log these closed generations, and the evaluations that have finished since the last call."""
@@ -70,17 +72,14 @@ class RunLog:
             self._warn_of_equal_fitness(closed)
             failed = f", {closed.failed} failed" if closed.failed else ""
             shown = in_values(closed, task)
-            log.info("generation %d: average %s, best %s%s", closed.number, format_number(shown.mean),
-                     format_number(shown.best), failed,
-                     extra={"facts": {"event": "generation", **asdict(closed)}})  # fmt: skip
+            scores = f"average {format_number(shown.mean)}, best {format_number(shown.best)}"
+            log_event(log, "generation", f"generation {closed.number}: {scores}{failed}", **asdict(closed))
         evaluations = self._run.background_jobs.evaluations
         if len(evaluations) > self._evaluations_logged:
             for each in islice(evaluations.finished.values(), self._evaluations_logged, None):  # as they finished
-                mean = format_mean(in_values(each, task))
-                log.info("evaluation of generation %d's mean: %s%s over %s",
-                         each.generation, mean, "" if each.error is None else " (standard error)",
-                         count_episodes(each),
-                         extra={"facts": {"event": "evaluation", **with_error(each)}})  # fmt: skip
+                mean = format_mean(in_values(each, task)) + ("" if each.error is None else " (standard error)")
+                text = f"evaluation of generation {each.generation}'s mean: {mean} over {count_episodes(each)}"
+                log_event(log, "evaluation", text, **with_error(each))
             self._evaluations_logged = len(evaluations)
 
     def _warn_of_equal_fitness(self, closed: StoredGeneration) -> None:
@@ -89,12 +88,12 @@ class RunLog:
         equal.add(closed)
         if equal.is_due and not self._run.settings.is_external:
             text = equal.describe(self._run.settings.task)
-            log.warning("%s", text, extra={"facts": {"event": "equal fitness", "generation": closed.number}})
+            log_event(log, "equal fitness", text, level=logging.WARNING, generation=closed.number)
 
     def write_notes(self) -> None:
         """Log the run's notes since the last call."""
         for note in self._run.take_notes():
-            log.info("%s", note.text, extra={"facts": {"event": note.what, "worker": note.worker}})
+            log_event(log, note.what, note.text, worker=note.worker)
 
     def check(self, snapshot: Snapshot, now: float) -> None:
         """Log what is due: a warning that no worker is present, the minute's summary, the join file's expiry."""
@@ -103,7 +102,7 @@ class RunLog:
         if now - self._summary_at >= SUMMARY_INTERVAL:
             self._summary_at = now
             text, facts = summary(snapshot.full_status())
-            log.info("%s", text, extra={"facts": facts})
+            log_event(log, "summary", text, **facts)
             if self._network.credentials is not None and now >= self._expiry_at:
                 self._expiry_at = now + DAY
                 _warn_of_expiry(self._network.credentials)
@@ -122,23 +121,22 @@ class RunLog:
         elif now - self._no_worker_since > NO_WORKER_SECONDS:
             self._no_worker_since = math.inf
             command = worker_command(self._network, self._name, self._run.settings.task.task)
-            log.warning("no worker is present: the run waits for one; on any host: %s", command,
-                        extra={"facts": {"event": "no worker", "command": command}})  # fmt: skip
+            text = f"no worker is present: the run waits for one; on any host: {command}"
+            log_event(log, "no worker", text, level=logging.WARNING, command=command)
 
 
 def _warn_of_expiry(credentials: Credentials) -> None:
     """Warn in the join file's last week: links break when a certificate expires."""
     if (left := credentials.time_left) < EXPIRY_WARNING:
-        facts = {"event": "expiry", "seconds": left.total_seconds()}
-        log.warning("this coordinator's join file: %s; issue another and start it again with that",
-                    describe_time_left(left), extra={"facts": facts})  # fmt: skip
+        text = f"this coordinator's join file: {describe_time_left(left)}; issue another and start it again with that"
+        log_event(log, "expiry", text, level=logging.WARNING, seconds=left.total_seconds())
 
 
 def summary(status: Status) -> tuple[str, dict[str, Any]]:
     """The status in one line, and as facts."""
     best, view = status.confirmed or status.best, LiveRunView.of_status(status)
     facts = {
-        "event": "summary", "state": status.state, "generation": status.generation.number,
+        "state": status.state, "generation": status.generation.number,
         "steps_per_second": status.throughput.steps_per_second, "best": None if best is None else best.mean,
         "best_error": None if best is None else best.error, "workers": status.workers.present, "slots": status.slots,
         "eta_seconds": view.eta.seconds, "failed": view.failed,

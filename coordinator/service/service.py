@@ -171,7 +171,7 @@ class Service:
             if self._has_uncommitted:
                 continue
             durable = self._commit()
-            if self._run.state.is_rewound:  # no verdict: the next life counts what workers still hold
+            if self._run.state.is_rewound:  # no verdict: the next incarnation counts what workers still hold
                 self._run_log.write_notes()
                 self._stopping = self._stopping or durable
                 continue
@@ -207,7 +207,7 @@ class Service:
     def _dismiss_workers(self, session: zenoh.Session) -> None:
         """Say to the workers that the run has ended, and wait briefly until they are gone.
 
-        R24: without this word such a worker would wait for another life of the coordinator.
+        R24: without this word such a worker would wait for another incarnation of the coordinator.
         """
         until = monotonic() + END_GRACE
         self._put(session, self._control.last_batches(), ended=True)
@@ -255,11 +255,11 @@ class Service:
 
     def _drain_events(self) -> None:
         """Handle the events that have arrived; without any, wait for one until a commit or a tick is due."""
-        patience = min(max(self._commit_at - monotonic(), 0.0), TICK) if self._has_uncommitted else TICK
+        timeout = min(max(self._commit_at - monotonic(), 0.0), TICK) if self._has_uncommitted else TICK
         with suppress(queue.Empty):
             for _ in range(MOST_EVENTS):
-                self._handle(*self._events.get(timeout=patience))
-                patience = 0.0
+                self._handle(*self._events.get(timeout=timeout))
+                timeout = 0.0
 
     def _handle(self, kind: str, event: Any) -> None:
         """Handle one event. An exception drops that event alone, for no message may end the run: its sender repeats it.

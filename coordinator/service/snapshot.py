@@ -177,12 +177,8 @@ def _open_generation(run: Run) -> GenerationStatus:
 
 
 def _stage(run: Run) -> StageStatus | None:
-    total, begun = len(run.settings.stages), run.generations.begun
-    if not total:
-        return None
-    own = begun.stage.settings
-    within = own.task.horizon, own.task.patience, own.population, own.episodes, own.racing, own.driven
-    return StageStatus(begun.stage.number, total, begun.since, *within)
+    begun = run.generations.begun
+    return StageStatus(begun.stage.number, begun.since) if run.settings.stages else None
 
 
 def _empty_population(candidate_scores: CandidateScores) -> Population:

@@ -6,7 +6,7 @@ __all__ = [
     "network",
     "limits",
     "live_log",
-    "schedule",
+    "stage_tables",
     "start",
     "freezing",
     "fork",

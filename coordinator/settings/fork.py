@@ -11,7 +11,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.stages import is_try
 from dreamfleet.coordinator.settings.config import RunConfig, config_values
-from dreamfleet.coordinator.settings.schedule import remaining_settings
+from dreamfleet.coordinator.settings.stage_tables import remaining_settings
 from dreamfleet.coordinator.settings.start import (
     SUBSPACE_FACT,
     StartPoint,
@@ -49,7 +49,7 @@ class Fork:
                 "temperature": stage.settings.task.temperature,
             }
             settings = {**config_values(stored.settings, stored.bundle_path), **present}
-            if not stage.whole:
+            if not stage.all_parameters:
                 settings["loaded_subspace"] = stored_subspace(stored.fact(SUBSPACE_FACT), stored.settings, stored.path)
         if {"environment", "observation", "normalise"} & set(given):
             settings.pop("task_options", None)  # described anew, and refused if that makes another world of it
@@ -66,5 +66,5 @@ class Fork:
         if config.sigma0 == self.settings["sigma0"] and not (stages and stages[0].sigma0):
             raise UsageError("another subspace than the run's makes a step something else: give --sigma0 too")
         if loaded_subspace is None and stages == self.settings["stages"]:  # inherited ones have nothing left to leave
-            return replace(config, stages=tuple(replace(each, whole=False) for each in stages))
+            return replace(config, stages=tuple(replace(each, all_parameters=False) for each in stages))
         return config

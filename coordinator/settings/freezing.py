@@ -24,7 +24,7 @@ from dreamfleet.common.runs.records import EXTERNAL, RunSettings
 from dreamfleet.common.runs.stages import Stage, stages_of
 from dreamfleet.coordinator.settings.config import DEFAULT_HORIZON, NO_SUBSPACE, RunConfig, frozen_values
 from dreamfleet.coordinator.settings.presets import check_preset_fits
-from dreamfleet.coordinator.settings.schedule import check_schedule, split_first_stage
+from dreamfleet.coordinator.settings.stage_tables import check_schedule, split_first_stage
 
 Scored = tuple[TaskSpec, ControllerShape, tuple[str, ...]]
 """What candidates are scored by: the task, the shape of a controller, and the packages of the fingerprint."""

@@ -14,7 +14,7 @@ from dreamfleet.coordinator.settings.config import NO_SUBSPACE, RunConfig
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.settings.presets import find_preset
-from dreamfleet.coordinator.settings.schedule import find_schedule, split_first_stage
+from dreamfleet.coordinator.settings.stage_tables import find_schedule, split_first_stage
 
 DEFAULT_NAME = "run"
 SUMMARY = "start a run: CMA-ES decides, workers score"

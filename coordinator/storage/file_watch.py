@@ -16,6 +16,7 @@ from pathlib import Path
 from tempfile import gettempdir
 
 from dreamfleet.common.errors import DreamfleetError, JournalError
+from dreamfleet.common.host.logs import log_event
 from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.coordinator.storage.journal_file import sqlite_side_files
@@ -30,7 +31,7 @@ Identity = tuple[int, int]
 
 
 class FileWatch:
-    """The files of one coordinator's life: its folder, its journal and that one's log, its bundle. Close it."""
+    """The files of one coordinator's incarnation: its folder, its journal and that one's log, its bundle. Close it."""
 
     def __init__(self, journal: Journal, bundle: ServedBundle | None, resume_command: Callable[[Path], str]) -> None:
         """`resume_command` gives the command that continues the run in a folder."""
@@ -156,8 +157,8 @@ class FileWatch:
         """A run without its world model could not be continued."""
         try:
             if self._bundle is not None and self._bundle.restore_into(self._folder):
-                log.warning("the run's copy of its world model was removed while it was served: written again",
-                            extra={"facts": {"event": "bundle written"}})  # fmt: skip
+                text = "the run's copy of its world model was removed while it was served: written again"
+                log_event(log, "bundle written", text, level=logging.WARNING)
         except OSError as error:
             log.warning("the run's copy of its world model was removed, and cannot be written: %s", error.strerror)
 

@@ -32,7 +32,7 @@ from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL
 from dreamfleet.coordinator.jobs.confirmation import Finalist
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollection
-from dreamfleet.coordinator.jobs.work import Work
+from dreamfleet.coordinator.jobs.scoring_job import ScoringJob
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
 from dreamfleet.coordinator.storage.batch_records import BatchRecords
 from dreamfleet.coordinator.storage.checksum_records import ChecksumRecords
@@ -44,10 +44,10 @@ from dreamfleet.coordinator.storage.verification_records import VerificationReco
 
 sqlite3.register_adapter(Checkpoint, Checkpoint.packed)  # when it is written, not while workers wait
 
-MAX_EVENTS = 10_000  # R26: strangers and failing hosts cause some
+MAX_EVENTS = 10_000  # R26: unknown senders and failing hosts cause some
 LEAVES = "leaves"  # what the last event of an incarnation is that was not killed
 # Seconds for which a write waits for another program's lock. A run tries again, so that it answers meanwhile.
-SERVING_PATIENCE, LEAVING_PATIENCE = 0.5, 5.0
+SERVING_TIMEOUT, LEAVING_TIMEOUT = 0.5, 5.0
 FINGERPRINT, HOST_CLASS = "fingerprint", "host_class"  # the facts' names
 
 
@@ -64,7 +64,7 @@ class StoredOpenGeneration:
 
 
 class Journal(JournalConnection):
-    """The journal of one coordinator's life: facts, generations, evaluations and events here, the rest in its parts."""
+    """The journal of one incarnation: facts, generations, evaluations and events here, the rest in its parts."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -132,7 +132,7 @@ class Journal(JournalConnection):
             )
 
     def check_incarnation(self) -> None:
-        """`JournalError` if another coordinator began a life in this journal: a lock held neither of them back."""
+        """`JournalError` if another coordinator has begun in this journal: a lock held neither of them back."""
         rows = self.read_written("SELECT value FROM run WHERE key = 'incarnation'")
         found = int(rows[0][0]) if rows else 0
         if found != self._incarnation:
@@ -157,7 +157,7 @@ class Journal(JournalConnection):
         self.set_fact("ended", why)
 
     def begin_incarnation(self) -> int:
-        """Number of this life of the coordinator, from 1; to be committed before anything is published."""
+        """Number of this incarnation of the coordinator, from 1; to be committed before anything is published."""
         number = int(self.fact("incarnation") or 0) + 1
         last = self.read_row("SELECT what FROM event ORDER BY number DESC LIMIT 1")
         killed = "; the last one was killed, crashed or could not write" if last not in (None, (LEAVES,)) else ""
@@ -166,12 +166,12 @@ class Journal(JournalConnection):
         self.drop_fact(REST)
         self.add_event(f"incarnation {number} begins{killed}")
         self.opened = self._committed = self.read_row("SELECT max(number) FROM generation")[0]
-        self.set_patience(SERVING_PATIENCE)
+        self.set_busy_timeout(SERVING_TIMEOUT)
         return number
 
     def end_incarnation(self) -> None:
         """Write that the coordinator leaves by itself."""
-        self.set_patience(LEAVING_PATIENCE)
+        self.set_busy_timeout(LEAVING_TIMEOUT)
         self.add_event("the coordinator leaves", LEAVES)
         if self.fact("ended") is not None:
             self.set_fact(REST, rest_checksum(self.read))  # nothing comes any more
@@ -337,7 +337,7 @@ class Journal(JournalConnection):
         with RunFolder(self.path.parent) as folder:
             return folder.history(), folder.evaluations()
 
-    def fitness_of(self, kind: Kind, work: Sequence[Work]) -> dict[bytes, float]:
+    def fitness_of(self, kind: Kind, work: Sequence[ScoringJob]) -> dict[bytes, float]:
         """As `ResultRecords.fitness_of`; results of dropped generations that these jobs want count again."""
         self.recalls.count_again(work)
         return self.results.fitness_of(kind, [each.digest for each in work])

@@ -184,7 +184,7 @@ class JournalConnection:
             self._writes, self._uncommitted = [*self._uncommitted, *self._writes], []
             raise
 
-    def set_patience(self, seconds: float) -> None:
+    def set_busy_timeout(self, seconds: float) -> None:
         """How long a write waits for another program's lock."""
         self._connection.execute(f"PRAGMA busy_timeout = {int(1000 * seconds)}")
 

@@ -10,7 +10,7 @@ from time import time
 from dreamfleet.common.runs.journal.journal_reader import digest_terms
 from dreamfleet.common.runs.run_folder import CONFIRMED, ENDED_AT, ENDING, STOP_KIND
 from dreamfleet.common.runs.seeds import CHOOSING_OFFSET
-from dreamfleet.coordinator.jobs.work import Work
+from dreamfleet.coordinator.jobs.scoring_job import ScoringJob
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
 from dreamfleet.coordinator.storage.checksum_records import ChecksumRecords
 from dreamfleet.coordinator.storage.journal_connection import JournalConnection
@@ -113,7 +113,7 @@ class RecallRecords:
             self._has_set_aside = row is not None
         return self._has_set_aside
 
-    def count_again(self, work: Iterable[Work]) -> None:
+    def count_again(self, work: Iterable[ScoringJob]) -> None:
         """Count results of dropped generations again that these jobs want, as results of the jobs' own generations.
 
         Of a mean that stays, another generation may want what a dropped one did.

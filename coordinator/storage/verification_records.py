@@ -32,13 +32,13 @@ class StoredAnswer:
 
 @dataclass(frozen=True)
 class StoredBar:
-    """Why a host may not add to the run; `by_anchor`: only the coordinator's own host said so.
+    """Why a host may not add to the run; `by_trusted`: only the coordinator's own host said so.
 
     `by_operator`: the operator named it, and no check found it wrong.
     """
 
     why: str
-    by_anchor: bool = False
+    by_trusted: bool = False
     by_operator: bool = False
 
 
@@ -90,15 +90,15 @@ class VerificationRecords:
 
     def barred(self) -> dict[str, StoredBar]:
         """The hosts that may not add to the run."""
-        rows = self._journal.read("SELECT host, why, by_anchor, by_operator FROM barred ORDER BY happened")
-        return {host: StoredBar(why, bool(anchor), bool(operator)) for host, why, anchor, operator in rows}
+        rows = self._journal.read("SELECT host, why, by_trusted, by_operator FROM barred ORDER BY happened")
+        return {host: StoredBar(why, bool(trusted), bool(operator)) for host, why, trusted, operator in rows}
 
     def bar(self, host: str, bar: StoredBar, incarnation: int) -> None:
         """Write that a host may not add to the run any more."""
         self._journal.write(
-            "INSERT OR REPLACE INTO barred (host, why, by_anchor, by_operator, incarnation, happened) "
+            "INSERT OR REPLACE INTO barred (host, why, by_trusted, by_operator, incarnation, happened) "
             "VALUES (?, ?, ?, ?, ?, ?)",
-            host, bar.why, int(bar.by_anchor), int(bar.by_operator), incarnation, time(),
+            host, bar.why, int(bar.by_trusted), int(bar.by_operator), incarnation, time(),
         )  # fmt: skip
 
     def unbar(self, host: str) -> None:

@@ -10,7 +10,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer
 
 SUMMARY = "bar a host that scores wrongly from a run, and score again all that it brought; --no-longer lets it in again"
 EXTRAS = ()
-PATIENCE, PAUSE = 5.0, 0.2  # seconds
+TIMEOUT, PAUSE = 5.0, 0.2  # seconds
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -30,7 +30,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Ask the coordinator of a live run; without one, change the run's journal on this disk.
 
-    Between two lives a coordinator holds the run's lock and does not answer, so it is asked again for a while.
+    Between two incarnations a coordinator holds the run's lock and does not answer, so it is asked again for a while.
     """
     from dreamfleet.common.client.client import Client
     from dreamfleet.common.errors import ConnectionFailedError
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.common.runs.run_paths import JOURNAL, resume_command
     from dreamfleet.coordinator.run.recall import bar_stored
 
-    host, name, then, until = check_worker_name(args.host), args.run_name, {}, monotonic() + PATIENCE
+    host, name, then, until = check_worker_name(args.host), args.run_name, {}, monotonic() + TIMEOUT
     while True:
         try:
             with Client(resolve_network(args, "operator", "coordinator")) as client:

@@ -29,7 +29,7 @@ from dreamfleet.coordinator.settings.live_log import parse_sinks
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.settings.presets import find_preset
 from dreamfleet.coordinator.settings.run_setup import DEFAULT_NAME, SUMMARY, check_limits, configure, load_run_config
-from dreamfleet.coordinator.settings.schedule import find_schedule, split_first_stage
+from dreamfleet.coordinator.settings.stage_tables import find_schedule, split_first_stage
 
 if TYPE_CHECKING:
     from dreamfleet.common.runs.run_folder import RunFolder

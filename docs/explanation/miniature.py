@@ -99,7 +99,7 @@ class Coordinator:
 
 def work(session: zenoh.Session, seconds: float) -> None:
     """Be a worker until the run ends. R7: each heartbeat repeats the results in the outbox, until their verdicts."""
-    identity = f"{os.uname().nodename}/{os.urandom(4).hex()}"  # name and life
+    identity = f"{os.uname().nodename}/{os.urandom(4).hex()}"  # name and process
     inbox: SimpleQueue[bytes] = SimpleQueue()
     session.declare_subscriber(f"{KEY}/job/{identity}", lambda sample: inbox.put(sample.payload.to_bytes()))
     held, outbox, batch = set[str](), dict[str, float](), dict[str, Any]()

@@ -85,7 +85,7 @@ def test_wrong_batches_are_refused_and_lose_nothing(fleet):
         assert taken.value.refusal == "conflict"
         assert (search.find("kept").wait() == fitness).all()
     with (
-        RemoteScorer(fleet.endpoint, "nobody", patience=0.0) as lost,
+        RemoteScorer(fleet.endpoint, "nobody", timeout=0.0) as lost,
         pytest.raises(ConnectionFailedError),
     ):
         lost.submit(vectors(1))

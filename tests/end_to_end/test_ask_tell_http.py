@@ -337,7 +337,7 @@ def test_a_secured_fleet_needs_an_operators_file(processes, access, endpoint, ra
     work(processes, access, endpoint, "first")
     for who in ("viewer", "second"):
         assert processes.call("serve", "--join", access.path(who), "--connect", endpoint, "--port", 0)[0] == 1
-        with RemoteScorer(access.network(who, endpoint), "safe", patience=0.0) as other:
+        with RemoteScorer(access.network(who, endpoint), "safe", timeout=0.0) as other:
             for ask in (lambda: other.submit(vectors(1)), lambda: other.find("a")):
                 with pytest.raises(ConnectionFailedError):
                     ask()

@@ -1,4 +1,4 @@
-"""What strangers put on the wire changes nothing, and is counted."""
+"""What unknown senders put on the wire changes nothing, and is counted."""
 
 import json
 import os
@@ -153,7 +153,7 @@ def test_large_messages_fill_no_memory_and_the_run_goes_on(processes, busy):
 
 
 @pytest.mark.slow
-def test_a_flood_of_hellos_leaves_few_guests_and_the_run_goes_on(processes, busy):
+def test_a_flood_of_hellos_leaves_few_unconfirmed_workers_and_the_run_goes_on(processes, busy):
     before = resident(busy)
     with open_session(Network(connect=(processes.endpoint,))) as session:
         for number in range(6_000):

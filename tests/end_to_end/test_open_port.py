@@ -37,8 +37,8 @@ def test_all_at_once_change_no_bit(processes, random_bundle, unharmed):
     evil, coordinator = harmed(processes, random_bundle, *ACTIONS)
     assert outcome(processes) == unharmed, "\n".join(coordinator.lines)
     assert evil.dropped.keys() >= {
-        "result of a stranger", "result of a job that was not given", "result of another fingerprint than its worker's",
-        "lease with more steps than a job has",
+        "result of an unknown worker", "result of a job that was not given",
+        "result of another fingerprint than its worker's", "lease with more steps than a job has",
     }  # fmt: skip
     assert not coordinator.events("paused")
 

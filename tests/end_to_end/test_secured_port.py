@@ -37,7 +37,7 @@ def test_all_at_once_change_no_bit(processes, access, endpoint, random_bundle, u
     assert not evil.overheard
     assert evil.seen
     assert evil.seen.isdisjoint(CLAIMED)
-    assert evil.dropped.keys() - {"result of a stranger"} == ARRIVES[who]
+    assert evil.dropped.keys() - {"result of an unknown worker"} == ARRIVES[who]
     assert ARRIVES[who] or not evil.dropped
     assert not coordinator.events("paused")
 

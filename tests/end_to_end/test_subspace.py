@@ -14,7 +14,7 @@ STAGES = """
 generations = 3
 
 [[stage]]
-whole = true
+all_parameters = true
 sigma0 = 0.05
 """
 
@@ -64,8 +64,8 @@ def check_forks(processes, subspace):
         forked.end()
     with open_run(processes.runs, "same") as same, open_run(processes.runs, "free") as free:
         assert (same.settings.subspace, free.settings.subspace) == (subspace.sha256, "")
-        assert [each.whole for each in same.settings.stages] == [False, True]
-        assert not any(each.whole for each in free.settings.stages)
+        assert [each.all_parameters for each in same.settings.stages] == [False, True]
+        assert not any(each.all_parameters for each in free.settings.stages)
     file.write_text('[run]\nsubspace = "gone.npz"\n')
     again = processes.resume("same", "--config", file)
     again.wait_for_event("kept", setting="subspace")

@@ -100,7 +100,7 @@ def test_of_two_that_begin_at_once_one_goes_on_and_ctrl_c_ends_it_in_order(proce
 
 @pytest.mark.slow
 def test_a_run_that_fails_stops_no_other(processes, small, monkeypatch):
-    monkeypatch.setattr(runner, "PAUSE_PATIENCE", 1.0)
+    monkeypatch.setattr(runner, "PAUSE_TIMEOUT", 1.0)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     vary = ("--vary", f"task={tasks.SLOW_TOY},{tasks.RAISING}")
     flags = (*small[:-2], *FLEET, "--failure-limit", 0.5, "--generations", 2, "--runs-dir", processes.runs)
@@ -111,7 +111,7 @@ def test_a_run_that_fails_stops_no_other(processes, small, monkeypatch):
 
 @pytest.mark.slow
 def test_a_run_from_which_its_own_workers_are_barred_fails_and_says_how_to_let_them_in(processes, sweep, monkeypatch):
-    monkeypatch.setattr(runner, "PAUSE_PATIENCE", 1.0)
+    monkeypatch.setattr(runner, "PAUSE_TIMEOUT", 1.0)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     assert sweep("--vary", "seed=1..2", "--generations", 1).finish()[0] == 0
     folder, words = processes.runs / "toys-seed2", ("--resume", "toys", "--workers", 2, "--runs-dir", processes.runs)

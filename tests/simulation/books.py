@@ -19,7 +19,7 @@ MAX_ABSENCES = 1  # beats in a row that have seen a lease's batch and do not sho
 SENT_AGAIN_WITHIN = 3.6  # a batch that was not seen, while its coordinator is awake; twice as long each time
 MAX_PATIENCE = 16  # times that
 REPEATED_WITHIN = 8.6  # a result without a verdict, while its worker is awake
-ASKS_WITHIN = 4.0  # a worker that sees another life than it has joined
+ASKS_WITHIN = 4.0  # a worker that sees another incarnation than it has joined
 
 
 def check_coordinator(fleet: Fleet) -> None:
@@ -54,7 +54,7 @@ def check_coordinator(fleet: Fleet) -> None:
     _require(jobs._failing.keys() <= jobs.keys(), "a job fails that nobody wants")
     checks = jobs.checks.keys()
     _require(checks == {digest for digest in jobs if jobs[digest].check}, "checks are not those that are wanted")
-    again = {digest for digest in jobs if jobs[digest].is_proof}
+    again = {digest for digest in jobs if jobs[digest].is_control}
     _require(not jobs._accepted.keys() & (jobs.keys() - checks - again), "an accepted job is wanted still")
     _require(all(count >= 0 for count in fleet.counts.values()), "a count is negative")
 
@@ -75,7 +75,7 @@ def check_credit(fleet: Fleet, send: SentBatch) -> None:
 
 
 class Sendings:
-    """When each batch of a coordinator's life was last sent, by the time that it was awake."""
+    """When each batch of a coordinator's incarnation was last sent, by the time that it was awake."""
 
     def __init__(self) -> None:
         self._awake = 0.0
@@ -109,7 +109,7 @@ class Sendings:
 
 
 def check_sight(worker: Worker, sees: str | None, since: float, now: float) -> None:
-    """A worker that sees another life of its coordinator than it has joined says hello."""
+    """A worker that sees another incarnation of its coordinator than it has joined says hello."""
     if worker.nonce is not None and sees not in (None, worker.nonce) and not worker.stopped:
         quiet = now - max(since, worker.asked_at, worker.awake_since)
         _require(quiet <= ASKS_WITHIN, "a worker does not join the life that it sees", "promptness")

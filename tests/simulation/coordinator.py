@@ -1,4 +1,4 @@
-"""One life of a coordinator: `Run` and `WorkerProtocol`, driven as `Service` drives them, on a simulated disk.
+"""One incarnation of a coordinator: `Run` and `WorkerProtocol`, driven as `Service` drives them, on a simulated disk.
 
 The only module that knows how the coordinator's parts are driven; what their books hold is read in `books.py`.
 """
@@ -30,7 +30,7 @@ BEAT = REPEAT = 1.0  # virtual seconds, as the run's intervals say
 TICK = 0.25  # virtual seconds between turns without a message; the product's are shorter, and cost as much
 LINGER = 0.005
 
-ANCHOR_KEY = bytes(32)  # of the coordinator's own host
+HOST_KEY = bytes(32)  # of the coordinator's own host
 
 OPENED, COMMITTED = "opened", "committed"
 Step = SentBatch | str | None
@@ -56,7 +56,7 @@ class Coordinator:
         self.nonce = f"{life:016x}"
         limits = LimitsConfig(generations=shape.generations if shape.ends else 0)
         network = NetworkConfig(beat=BEAT, verify=shape.verify, failure_limit=1.0)
-        self.run = Run(SimulatedJournal(disk, witness), settings_of(shape), limits, network, now, ANCHOR_KEY)
+        self.run = Run(SimulatedJournal(disk, witness), settings_of(shape), limits, network, now, HOST_KEY)
         self.fleet = self.run.fleet
         self.worker_protocol = WorkerProtocol(self.run, "simulated", self.nonce, Intervals(BEAT, REPEAT))
         self.draining = False

@@ -98,14 +98,14 @@ class Found:
 
 
 def play_with(
-    schedule: Schedule, lies: dict[int, Lie], anchors: frozenset[int] = frozenset(),
+    schedule: Schedule, lies: dict[int, Lie], trusted: frozenset[int] = frozenset(),
     classes: dict[int, str] | None = None, bars: dict[int, float] | None = None,
 ) -> Found:  # fmt: skip
     """Play a schedule with liars; `Violation` if a rule is broken that holds with liars too.
 
     The operator bars the hosts of `bars`, each at its moment.
     """
-    world = World(schedule, patience=5000.0, lies=lies, anchors=anchors, classes=classes or {}, bars=bars or {})
+    world = World(schedule, patience=5000.0, lies=lies, trusted=trusted, classes=classes or {}, bars=bars or {})
     world.witness = LenientWitness(schedule.shape)
     _playing[:] = [world]
     honest = True

@@ -97,7 +97,7 @@ MUTANTS: dict[str, Mutant] = {
         {**CHECKED, "confirm_episodes": 4, "evaluate_every": 1, "ends": True},
     ),
     "generations_do_not_wait_for_their_checks": Mutant(Verification, "holds_generation", False, CHECKED),
-    "fleet_never_sends_a_batch_again": Mutant(Member, "take_overdue_batches", lambda self, now, patience: iter(())),
+    "fleet_never_sends_a_batch_again": Mutant(Member, "take_overdue_batches", lambda self, now, after: iter(())),
     "fleet_never_misses_a_job_that_beats_do_not_show": Mutant(member, "ABSENT_HEARTBEATS", 10**9),
     "fleet_asks_for_results_of_nobody": Mutant(Fleet, "find_job_for_result", lambda self, identity, result: None),
     "member_counts_on_after_a_silence": Mutant(Member, "start_numbering", lambda self, numbering: None),

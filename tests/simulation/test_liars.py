@@ -31,9 +31,9 @@ def away(worker, seconds):
     return (Fault(0.02, "kill_worker", worker, seconds, 0.0),)
 
 
-def assert_barred(schedule, lies=HALF, anchors=frozenset(), bars=None):
+def assert_barred(schedule, lies=HALF, trusted=frozenset(), bars=None):
     """Whoever lies is barred, nobody else, and what counts is true."""
-    found = play_with(schedule, lies, anchors, bars=bars)
+    found = play_with(schedule, lies, trusted, bars=bars)
     assert found.barred == {f"w{host}" for host in lies}
     assert found.is_honest
 
@@ -52,7 +52,7 @@ def test_a_race_that_lies_decided_is_decided_again(lie, seed):
 
 
 @pytest.mark.parametrize(
-    ("schedule", "lies", "anchors"),
+    ("schedule", "lies", "trusted"),
     [
         (fleet(3, 0.3, generations=6, faults=away(1, 6.0)), HALF, ()),
         (fleet(3), HALF, ()),
@@ -62,11 +62,11 @@ def test_a_race_that_lies_decided_is_decided_again(lie, seed):
     ],
     ids=["a late liar", "no anchor", "two held until a third comes", "the coordinator's own host", "a stage by score"],
 )
-def test_whoever_it_is_a_third_host_decides_and_the_run_goes_back_to_where_it_came(schedule, lies, anchors):
-    assert_barred(schedule, lies, anchors)
+def test_whoever_it_is_a_third_host_decides_and_the_run_goes_back_to_where_it_came(schedule, lies, trusted):
+    assert_barred(schedule, lies, trusted)
 
 
-def test_memory_that_fails_once_is_found_between_two_hosts_without_an_anchor():
+def test_memory_that_fails_once_is_found_between_two_hosts_without_a_trusted_host():
     assert_barred(fleet(2), {1: one_flip(3)})
 
 

@@ -17,7 +17,7 @@ Confirmed = tuple[str | None, set[bytes]]
 
 
 class Witness:
-    """Of one play, through all lives of its coordinator."""
+    """Of one play, through all incarnations of its coordinator."""
 
     def __init__(self, shape: Shape) -> None:
         self.truth = truth_of(shape)

@@ -29,11 +29,11 @@ from dreamfleet.common.protocol.messages import (
     TaskSpec,
     UploadPart,
 )
-from dreamfleet.common.security.anchor_key import proof_for
+from dreamfleet.common.security.host_key import token_for
 from dreamfleet.worker.service.backlog import Backlog
 from dreamfleet.worker.service.membership import LeaveConditions, Membership, WorkerLoad
 from dreamfleet.worker.service.outbox import BURST_INTERVAL, Outbox, UploadQueue
-from tests.simulation.coordinator import ANCHOR_KEY, BEAT, REPEAT
+from tests.simulation.coordinator import BEAT, HOST_KEY, REPEAT
 from tests.simulation.schedule import Shape
 from tests.simulation.truth import STEPS, TASK, fitness_of, rollout_of
 from tests.simulation.truth import fails as truth_fails
@@ -97,7 +97,7 @@ class Worker:
         self.slowness = 1.0
         self.lie: Callable[[Job, float], float] = lambda _, fitness: fitness  # what it says of a job
         self.host_class = class_from_fingerprint("f")
-        self.is_anchor = False  # whether it is on the coordinator's own host
+        self.is_trusted = False  # whether it is on the coordinator's own host
         self.failures = 0  # turns that are still to fail
         self.nonce: str | None = None  # of the life that it has joined; `None` before the first
         self.inbox: deque[Any] = deque()
@@ -209,10 +209,10 @@ class Worker:
         self._question += 1
         self.asked_at = now
         self._waits_until = now + HELLO_TIMEOUT
-        anchor = proof_for(ANCHOR_KEY, self.identity) if self.is_anchor else ""
+        host_token = token_for(HOST_KEY, self.identity) if self.is_trusted else ""
         offered = self.identity, (TASK,), "f", self._shape.slots, NUMERIC_PACKAGES
         versions = PROTOCOL_VERSION, PROTOCOL_VERSION, "0"
-        request = HelloRequest(*versions, *offered, host_class=self.host_class, anchor=anchor)
+        request = HelloRequest(*versions, *offered, host_class=self.host_class, host_token=host_token)
         self._send((request, self._question))
 
     def _take(self, event: JobBatch | Token, now: float) -> None:

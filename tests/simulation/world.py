@@ -68,7 +68,7 @@ class World:
     patience: float = PATIENCE
     lies: dict[int, Callable[[Job, float], float]] = field(default_factory=dict)  # by host
     classes: dict[int, str] = field(default_factory=dict)  # by host
-    anchors: frozenset[int] = frozenset()  # hosts that are the coordinator's own
+    trusted: frozenset[int] = frozenset()  # hosts that are the coordinator's own
     bars: dict[int, float] = field(default_factory=dict)  # when the operator bars a host
 
     def __post_init__(self) -> None:
@@ -255,7 +255,7 @@ class World:
             self._send_up(host, identity, message)
 
         worker = Worker(identity, self.shape, self._spec, self.now, send, self.scored)
-        worker.lie, worker.is_anchor = self.lies.get(host, worker.lie), host in self.anchors
+        worker.lie, worker.is_trusted = self.lies.get(host, worker.lie), host in self.trusted
         worker.host_class = self.classes.get(host, worker.host_class)
         self.workers[host] = worker
         self.links[host].sees = None

@@ -38,7 +38,7 @@ CLAIMED = (keys.live_coordinator(RUN, "f" * 16), keys.live_worker(RUN, "own.1/0b
 ASKED = 5  # seconds that a query stays open; nothing waits for it
 
 
-class Guest:
+class Intruder:
     """A worker that the attacker lets join; with a `capacity` it gets jobs, which it never runs."""
 
     def __init__(self, identity, capacity):
@@ -56,7 +56,7 @@ class Guest:
 class Attacker:
     """Sends valid messages through a raw `session`, and overhears everything through the session `ears`.
 
-    `seat` is the seat of its join file; the names of its guests end in it.
+    `seat` is the seat of its join file; the names of its intruders end in it.
     """
 
     def __init__(self, session, ears, seat=None):
@@ -70,7 +70,7 @@ class Attacker:
         self.overheard, self.asked = [], []  # keys of samples and queries that reached its own session
         self.seen = set()  # liveliness tokens
         end = "" if seat is None else f".{seat}"
-        self.reporter, self.holder = Guest(f"reporter{end}/0badc0de", 0), Guest(f"holder{end}/0badc0de", 1)
+        self.reporter, self.holder = Intruder(f"reporter{end}/0badc0de", 0), Intruder(f"holder{end}/0badc0de", 1)
         self._held = [
             ears.declare_subscriber(keys.all_workers("job", RUN), direct(self._overhear_batch)),
             ears.declare_subscriber(keys.all_workers("result", RUN), direct(self._overhear_results)),
@@ -102,9 +102,9 @@ class Attacker:
 
     def _overhear_batch(self, sample):
         batch, worker = decode(JobBatch, sample.payload.to_bytes()), keys.worker_from_key(str(sample.key_expr))
-        for guest in (self.reporter, self.holder):
-            if worker == guest.identity:
-                guest.take(batch)
+        for intruder in (self.reporter, self.holder):
+            if worker == intruder.identity:
+                intruder.take(batch)
         if worker.startswith("own") and batch.nonce != "forged":
             self.head, self.worker = batch, worker
         self.jobs.update({job.digest: job for job in batch.jobs})
@@ -132,18 +132,18 @@ class Attacker:
 
         self.session.get(where, answered, timeout=ASKED)
 
-    def join(self, guest, steps):
-        """Let a guest join; its beat claims to run all jobs that it got, at so many steps."""
+    def join(self, intruder, steps):
+        """Let an intruder join; its beat claims to run all jobs that it got, at so many steps."""
         if self.fingerprint is None or self.head is None:
             return
-        self.hello(guest.identity)
-        running = tuple(RunningJob(digest[:TAG_BYTES], steps) for digest in list(guest.held)[-64:])
+        self.hello(intruder.identity)
+        running = tuple(RunningJob(digest[:TAG_BYTES], steps) for digest in list(intruder.held)[-64:])
         beat = msgspec.structs.replace(
             MSGPACK["beat"], run_uid=self.head.run_uid, incarnation=self.head.incarnation, nonce=self.head.nonce,
-            numbering=guest.numbering, seen=guest.seen, capacity=guest.capacity, slots=guest.capacity, queued=(),
-            unacked=(), running=running,
+            numbering=intruder.numbering, seen=intruder.seen, capacity=intruder.capacity, slots=intruder.capacity,
+            queued=(), unacked=(), running=running,
         )  # fmt: skip
-        self.session.put(keys.heartbeat(RUN, guest.identity), encode(beat))
+        self.session.put(keys.heartbeat(RUN, intruder.identity), encode(beat))
 
     def report(self, worker, *results, fingerprint=None):
         if self.head is not None:
@@ -236,8 +236,8 @@ def reports_as_the_working_worker(evil, _round):
 
 def beats_as_the_working_worker(evil, _round):
     if evil.worker is not None:
-        guest = Guest(evil.worker, 1)
-        evil.join(guest, 10**12)
+        intruder = Intruder(evil.worker, 1)
+        evil.join(intruder, 10**12)
 
 
 def sends_a_worker_home(evil, number):

@@ -9,7 +9,7 @@ from dreamfleet.common.runs.run_paths import JOURNAL
 from tests.support import tasks
 
 SIZE = 867  # parameters of a linear controller of the random bundle
-PATIENCE = 120.0
+TIMEOUT = 120.0
 
 
 def begin(processes, bundle, *more, task=tasks.TOY, name="test"):
@@ -17,7 +17,7 @@ def begin(processes, bundle, *more, task=tasks.TOY, name="test"):
 
 
 def scorer(processes, endpoint=None, name="test"):
-    return RemoteScorer(endpoint or processes.endpoint, name, patience=PATIENCE)
+    return RemoteScorer(endpoint or processes.endpoint, name, timeout=TIMEOUT)
 
 
 def vectors(count, first=0.0):

@@ -5,7 +5,7 @@ from msgspec.structs import replace
 
 from dreamfleet.common.protocol.messages import TAG_BYTES, Heartbeat, Result, RunningJob
 from dreamfleet.coordinator.dispatch.fleet import Fleet as _Fleet
-from dreamfleet.coordinator.jobs.work import make_work, vector_bytes
+from dreamfleet.coordinator.jobs.scoring_job import make_jobs, vector_bytes
 from tests.support.samples import HEAD, SPEC
 
 
@@ -26,7 +26,7 @@ BEAT = 1.0
 
 def work(count, kind="score", generation=0):
     vector = vector_bytes(np.arange(4.0) + generation)
-    return make_work(SPEC, kind, generation, 0, vector, range(1000, 1000 + count))
+    return make_jobs(SPEC, kind, generation, 0, vector, range(1000, 1000 + count))
 
 
 def beat(capacity=1, seen=0, numbering=0, queued=(), running=(), unacked=(), rate=0.0, steps=5, reason=""):

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from dreamfleet.common.protocol.messages import Job, Result
-from dreamfleet.coordinator.jobs.work import make_work, vector_bytes
+from dreamfleet.coordinator.jobs.scoring_job import make_jobs, vector_bytes
 from tests.support.dispatched import Fleet, beat, work
 from tests.support.samples import SPEC
 
@@ -93,7 +93,7 @@ class Played:
         self.fleet.jobs.begin_generation(number)
         for candidate in range(self._population):
             vector = vector_bytes(np.arange(float(self._size)) + candidate + number * 1000)
-            jobs = make_work(SPEC, "score", number, candidate, vector, range(1000, 1000 + self._episodes))
+            jobs = make_jobs(SPEC, "score", number, candidate, vector, range(1000, 1000 + self._episodes))
             self._open |= {each.digest for each in jobs}
             self.fleet.jobs.offer(jobs)
 

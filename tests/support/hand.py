@@ -197,7 +197,7 @@ class Hand:
 
 
 @contextmanager
-def stranger(hand, key, answer):
+def unknown_sender(hand, key, answer):
     """Another session at the router of `hand`: it answers each query first, as if for all, by `answer(query)`."""
 
     def reply(query):

@@ -4,7 +4,7 @@ import numpy as np
 
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.api import Continuous
-from dreamfleet.worker.tasks.policy import DriverPolicy
+from dreamfleet.worker.tasks.model_free_policies import DriverPolicy
 from dreamfleet.worker.tasks.recordable import RecordableTask
 
 STEPS = 40

@@ -208,7 +208,7 @@ class _Trial:
         """Step with both bounds and random corners of the actions, as controllers with large outputs do."""
         import numpy as np
 
-        from dreamfleet.worker.tasks.policy import FlatPolicy
+        from dreamfleet.worker.tasks.model_free_policies import FlatPolicy
 
         if not isinstance(self._policy, FlatPolicy) or not getattr(self._actions, "squashed", True):
             return  # others may take other outputs, and those without tanh have no bounds

@@ -164,7 +164,7 @@ def score(
     return tally.score()
 
 
-def score_together(
+def score_side_by_side(
     environments: Sequence[gymnasium.Env[Any, Any]],
     policies: Policies,
     parameters: Sequence[NDArray[np.float32]],

@@ -18,9 +18,9 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_from_fingerprint
-from dreamfleet.common.protocol.messages import MOST_TOGETHER, Kind, TaskSpec
+from dreamfleet.common.protocol.messages import MAX_SIDE_BY_SIDE, Kind, TaskSpec
 from dreamfleet.common.schema.display import Displayed
-from dreamfleet.worker.scoring.episode import EpisodeConfig, score, score_together
+from dreamfleet.worker.scoring.episode import EpisodeConfig, score, score_side_by_side
 from dreamfleet.worker.scoring.host_class_probe import REPEAT_LIMIT, HostClassProbe
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, Rollout
 from dreamfleet.worker.scoring.watched_policy import WatchedPolicy
@@ -121,9 +121,9 @@ class Scorer(Displayed):
             if self.observer is not None and isinstance(batch, WatchableBatch):
                 batch = batch.watched(self.observer)
             return batch.score([(parameters, seed) for _, parameters, seed in jobs], on_step)
-        if 1 < len(jobs) <= self.together and self.observer is None:
-            assert self._policies is not None  # `together` has made them
-            return score_together(
+        if 1 < len(jobs) <= self.side_by_side and self.observer is None:
+            assert self._policies is not None  # `side_by_side` has made them
+            return score_side_by_side(
                 (self._environment, *self._more_environments), self._policies,
                 [parameters for _, parameters, _ in jobs],
                 [self.episode_config(kind, seed, spec) for kind, _, seed in jobs], on_step,
@@ -205,14 +205,14 @@ class Scorer(Displayed):
             close_environment(watched)
 
     @cached_property
-    def together(self) -> int:
+    def side_by_side(self) -> int:
         """How many candidates' drives it does side by side. Their environments are made when this is first asked."""
         reality, policy = self._task.reality(self._assignment), self._policy
         if self.spec.measures or isinstance(reality, BatchedTask) or not isinstance(policy, PolicySideBySide):
             return 1
         with suppress(BaseException):  # then they are driven one by one; `SystemExit` too, of a simulator
             self._policies = policy.side_by_side()
-            for _ in range(min(reality.batch_size, MOST_TOGETHER) - 1):
+            for _ in range(min(reality.batch_size, MAX_SIDE_BY_SIDE) - 1):
                 self._more_environments.append(self._task.make_environment(self._assignment))
             return 1 + len(self._more_environments)
         return 1

@@ -20,7 +20,7 @@ from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import CountingDecoder, encode_json
 from dreamfleet.common.protocol.messages import MIN_SHARE, HelloReply, HelloRequest, Intervals, TaskSpec
 from dreamfleet.common.schema.validation import MAX_TEXT, MalformedError, from_plain
-from dreamfleet.common.security.anchor_key import anchor_proof
+from dreamfleet.common.security.host_key import host_token
 from dreamfleet.common.transport.query import query_all, query_every_responder
 from dreamfleet.worker.tasks.registry import check_task_allowed
 
@@ -30,7 +30,7 @@ MAX_RUNS_LISTED = 8  # run names in an error message
 
 @dataclass(frozen=True)
 class Admission:
-    """A run that this worker has joined, in one life of its coordinator."""
+    """A run that this worker has joined, in one incarnation of its coordinator."""
 
     run: str
     run_uid: str
@@ -56,7 +56,7 @@ class CoordinatorLink:
 
     @property
     def identity(self) -> str:
-        """The worker's name and life."""
+        """The worker's name and process."""
         return self.hello.worker
 
     def request_admission(self, run: str | None, host_class: str = "", joined_run_uid: str = "") -> Admission | None:
@@ -82,10 +82,10 @@ class CoordinatorLink:
         """The answer to one hello request.
 
         R23: a single refusal decides nothing, because anybody on the network can answer. The joined run comes first,
-        then a welcome, then a refusal. Of equal answers one is drawn at random, so that no stranger always wins.
+        then a welcome, then a refusal. Of equal answers one is drawn at random, so that no unknown sender always wins.
         """
         key = keys.secured_hello(run or "*", request.worker) if self.secured else keys.hello(run or "*")
-        request, replies = replace(request, anchor=anchor_proof(request.worker)), []
+        request, replies = replace(request, host_token=host_token(request.worker)), []
         for _, payload in query_every_responder(self.session, [key], HELLO_TIMEOUT, encode_json(request)):
             reply = self.inbox.decode_json(HelloReply, payload)
             if reply is not None and _is_reply_of(reply, run):

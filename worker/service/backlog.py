@@ -14,8 +14,8 @@ from math import prod
 from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.messages import MAX_LEASES, Job, JobBatch, TaskSpec, VectorPart
 
-# R26: strangers can send batches too, so what they can fill is limited. The coordinator gives a dropped job again,
-# because the next heartbeats do not list it.
+# R26: unknown senders can send batches too, so what they can fill is limited. The coordinator gives a dropped job
+# again, because the next heartbeats do not list it.
 MAX_UNUSED_VECTORS = 64  # vectors that no queued job needs
 MAX_BATCHES_AHEAD = 1024  # batches after a missing one
 DAMAGED = Failure.of_host("the job's digest is not of its content")  # it says nothing of the candidate
@@ -111,7 +111,7 @@ class Backlog:
                 first = taken[0][0]
                 if len(taken) >= (drives if first.driven and drives else count):
                     break
-                if job.runs_alone or job.overrides != first.overrides:
+                if job.is_background or job.overrides != first.overrides:
                     continue
             vector = self._assemble(job.vector)
             if job.vector not in self._vectors:  # its parts were of something else
@@ -119,7 +119,7 @@ class Backlog:
             elif vector is not None:
                 taken.append((job, vector))
                 del self._jobs[digest]
-                if job.runs_alone:
+                if job.is_background:
                     break
         return taken
 

@@ -20,6 +20,7 @@ from dreamfleet.common.artifacts.bundle_store import BundleStore, default_cache
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import BundleError, DownloadError
 from dreamfleet.common.files.regular_files import open_append
+from dreamfleet.common.host.logs import log_event
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import CountingDecoder
 from dreamfleet.common.protocol.messages import MAX_PART, BundlePart
@@ -61,8 +62,8 @@ def fetch_bundle(
                 if from_start and len(sources) == 1:  # otherwise any of several sources may have sent the wrong bytes
                     corrupt_sources |= sources
                 continue
-            log.info("fetched bundle %s, %.1f MB", sha256[:12], bundle.path.stat().st_size / 1e6,
-                     extra={"facts": {"event": "fetched", "bundle": sha256}})  # fmt: skip
+            text = f"fetched bundle {sha256[:12]}, {bundle.path.stat().st_size / 1e6:.1f} MB"
+            log_event(log, "fetched", text, bundle=sha256)
             return bundle
     raise DownloadError(
         f"the bundle {sha256[:12]}... arrived damaged {MAX_ATTEMPTS} times: check the coordinator's copy"
@@ -121,7 +122,7 @@ def _download(
 
 
 def _choose_source(parts: Collection[str], corrupt_sources: Collection[str]) -> str:
-    """One of the sources, at random, so that no stranger is always chosen; a corrupt one only if there is no other."""
+    """One of the sources, at random, so that no liar is always chosen; a corrupt one only if there is no other."""
     known = sorted(set(parts) - set(corrupt_sources)) or sorted(parts)
     return random.choice(known) if known else ""  # noqa: S311 - no secret
 

@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 class ChildReady:
     """First message of a child: it can score.
 
-    `drawn_by` names what draws its pictures; `together` says how many drives it does side by side.
+    `drawn_by` names what draws its pictures; `side_by_side` says how many drives it does side by side.
     """
 
     drawn_by: str
     host_class: str
-    together: int = 1
+    side_by_side: int = 1
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def _make_scorer(pipe: Connection[Any, Any], arguments: ScorerArguments) -> Scor
             opened = Bundle.open(bundle, spec.bundle)
             check_world_allowed(opened, allowed_tasks)
         scorer = Scorer(spec, opened, arguments.torch_device)
-        pipe.send(ChildReady(scorer.drawn_by, scorer.host_class, scorer.together))
+        pipe.send(ChildReady(scorer.drawn_by, scorer.host_class, scorer.side_by_side))
         return scorer
     except BaseException as error:  # a simulator may raise `SystemExit`
         failure = ScoringFailure.of(error)

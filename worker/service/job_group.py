@@ -13,7 +13,7 @@ import numpy as np
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.failures import describe_job
 from dreamfleet.common.protocol.measures import LARGEST_MEASURE
-from dreamfleet.common.protocol.messages import MAX_UPLOAD, MOST_TOGETHER, Job, Result, TaskSpec
+from dreamfleet.common.protocol.messages import MAX_SIDE_BY_SIDE, MAX_UPLOAD, Job, Result, TaskSpec
 from dreamfleet.common.protocol.result_bounds import LONGEST_EPISODE, clamp_count, rejection_reason
 from dreamfleet.worker.service.failure_log import ScoringFailure
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # the child imports this module before it imports what scores
     from dreamfleet.worker.scoring.scorer import Scorer
     from dreamfleet.worker.tasks.api import Score
 
-MOST_TRIED_ALONE = MOST_TOGETHER  # jobs of a failed group that are then tried one by one
+MOST_TRIED_SINGLY = MAX_SIDE_BY_SIDE  # jobs of a failed group that are then tried one by one
 
 JobWithVector = tuple[Job, bytes]
 """A job, and the bytes of its vector."""
@@ -43,7 +43,7 @@ class JobGroup:
     @property
     def largest_size(self) -> int:
         """Bytes of the vectors of a group of such jobs, of which the next one may have more."""
-        return max(len(vector) for _, vector in self.work) * max(len(self.work), MOST_TRIED_ALONE)
+        return max(len(vector) for _, vector in self.work) * max(len(self.work), MOST_TRIED_SINGLY)
 
     @property
     def stall(self) -> float:
@@ -53,7 +53,7 @@ class JobGroup:
     @property
     def is_small(self) -> bool:
         """Whether it has several jobs, but few enough to try them one by one."""
-        return 1 < len(self.work) <= MOST_TRIED_ALONE
+        return 1 < len(self.work) <= MOST_TRIED_SINGLY
 
     def split(self, wanted: Collection[bytes] | None = None) -> list[JobGroup]:
         """Its jobs for another child, or those with the digests `wanted`: one by one if the group is small."""

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 NEXT_RUN_AFTER = 5.0  # seconds without a coordinator after which an idle worker of any run looks for another
-NEXT_RUN_PATIENCE = 60.0  # the same for one that has jobs or results of the run
+NEXT_RUN_TIMEOUT = 60.0  # the same for one that has jobs or results of the run
 SEARCH_INTERVAL = 5.0  # seconds without a coordinator after which, and then between which, it looks for its run
 SILENT_BEATS = 5  # heartbeat intervals in which a coordinator that knows this worker would have answered
 UPLOAD_GRACE = 30.0  # seconds more while a rollout is being sent: the verdict comes only after it
@@ -66,7 +66,7 @@ class Membership:
         self._stops.count += 1
 
     def join(self, nonce: str, beat: float, now: float) -> None:
-        """Record that a run welcomed this worker: its coordinator's life `nonce`, and the heartbeat interval `beat`."""
+        """Record that a run welcomed this worker: its coordinator's `nonce`, and the heartbeat interval `beat`."""
         self._beat = beat
         self._coordinators: set[str] = set()  # nonces of the coordinators in sight
         self.run_is_over = ""  # why the joined run is over and its workers leave; empty: it is not
@@ -77,7 +77,7 @@ class Membership:
         self.rejoin(nonce, now)
 
     def rejoin(self, nonce: str, now: float) -> None:
-        """Record that the run welcomed this worker again, perhaps in another life of its coordinator."""
+        """Record that the run welcomed this worker again, perhaps in another incarnation of its coordinator."""
         self._nonce = nonce
         self._may_be_forgotten = False
         self._silent_since = now
@@ -127,7 +127,7 @@ class Membership:
     def plan_without_coordinator(self) -> str:
         """What it does while its coordinator is out of sight, in words."""
         if self.conditions.serves_any:
-            after = f"{NEXT_RUN_AFTER:g} s, with results of it after {NEXT_RUN_PATIENCE:g} s"
+            after = f"{NEXT_RUN_AFTER:g} s, with results of it after {NEXT_RUN_TIMEOUT:g} s"
             return f"leaves this run after {after}, and serves others"
         if self.conditions.leaves_with_run:
             return f"leaves unless it is back within {self.conditions.coordinator_timeout:g} s"
@@ -153,7 +153,7 @@ class Membership:
 
         R24: a draining worker leaves once all is delivered, when its time is up, or, once it is stopped, if nobody is
         in sight who takes what is left. A run ends by its coordinator's word; silence alone may be a cut link or a
-        restart, so it needs long patience.
+        restart, so it needs a long timeout.
         """
         if self._stops.count > 1:
             return "stopped by two signals, without draining"
@@ -161,23 +161,23 @@ class Membership:
             return self.run_is_over
         if self._drain_until is not None:
             is_late = now > self._drain_until
-            if busy and not is_late and not (self._stops.count and self._is_alone(now, SEARCH_INTERVAL)):
+            if busy and not is_late and not (self._stops.count and self._lacks_coordinator(now, SEARCH_INTERVAL)):
                 return ""
             why = "drained after a stop signal" if self._stops.count else "drained at the end of its lifetime"
             when = "--drain-timeout was over" if is_late else "no coordinator was in sight"
             return f"{why}, but jobs or results were left when {when}" if busy else why
         if self.gives_up(now):
             return f"no coordinator was reachable for {self.conditions.coordinator_timeout:g} s"
-        if self.conditions.serves_any and self._is_alone(now, NEXT_RUN_PATIENCE if busy else NEXT_RUN_AFTER):
+        if self.conditions.serves_any and self._lacks_coordinator(now, NEXT_RUN_TIMEOUT if busy else NEXT_RUN_AFTER):
             return "it takes another run"
         return ""
 
     def gives_up(self, now: float) -> bool:
         """Whether the coordinator has been out of sight for so long that waiting for it makes no sense."""
-        alone = self._is_alone(now, self.conditions.coordinator_timeout)
+        alone = self._lacks_coordinator(now, self.conditions.coordinator_timeout)
         return self.conditions.leaves_with_run and alone and not self.is_leaving(now)
 
-    def _is_alone(self, now: float, seconds: float) -> bool:
+    def _lacks_coordinator(self, now: float, seconds: float) -> bool:
         """Whether no coordinator has been in sight for longer than `seconds`."""
         return self._no_coordinator_since is not None and now - self._no_coordinator_since > seconds
 
@@ -191,15 +191,15 @@ class Membership:
     def must_rejoin(self, now: float, load: WorkerLoad) -> bool:
         """Whether to say hello again.
 
-        R22: it does so when the coordinator was out of sight, is in another life, or is silent although it owes an
-        answer. An extra hello costs one message; a forgotten worker would idle for good.
+        R22: it does so when the coordinator was out of sight, is in another incarnation, or is silent although it owes
+        an answer. An extra hello costs one message; a forgotten worker would idle for good.
         """
         if not self._coordinators or now < self._next_hello_at:
             return False
         if self._may_be_forgotten or self._nonce not in self._coordinators:
             return True
-        patience = SILENT_BEATS * self._beat + (UPLOAD_GRACE if load.uploading else 0.0)
-        return now - self._silent_since > patience and (load.idle or load.awaits_verdict)
+        timeout = SILENT_BEATS * self._beat + (UPLOAD_GRACE if load.uploading else 0.0)
+        return now - self._silent_since > timeout and (load.idle or load.awaits_verdict)
 
 
 class RefusalBackoff:

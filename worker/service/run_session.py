@@ -17,6 +17,7 @@ import zenoh
 
 from dreamfleet.common.errors import ConnectionFailedError, RefusedError
 from dreamfleet.common.host.error_counter import ErrorCounter
+from dreamfleet.common.host.logs import log_event
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.printable import one_line, plural
 from dreamfleet.common.protocol import keys
@@ -61,7 +62,7 @@ class RunSession:
         self._error_counter = ErrorCounter(log)
         self._next_heartbeat_at = 0.0
         self._finished = self._steps_finished = 0
-        self._said_alone = self._said_shut_out = False
+        self._said_waiting = self._said_shut_out = False
         self._coordinator_version = package_version("dreamfleet")
 
     @property
@@ -103,8 +104,8 @@ class RunSession:
             self._frame_publisher,
         ]
         device = f", dreams on {self._slots.torch_device}" if self._slots.torch_device else ""
-        log.info("joined run %s as %s, %s%s", run, self._link.identity, plural(len(self._slots), "slot"), device,
-                 extra={"facts": {"event": "joined", "run": run, "worker": self._link.identity}})  # fmt: skip
+        text = f"joined run {run} as {self._link.identity}, {plural(len(self._slots), 'slot')}{device}"
+        log_event(log, "joined", text, run=run, worker=self._link.identity)
         self._note_version()
 
     def _main_loop(self) -> str:
@@ -120,9 +121,8 @@ class RunSession:
                 # R24: the next heartbeat does not list unstarted jobs, so the coordinator gives them away at once.
                 self._backlog.clear()
                 self._slots.abandon_waiting()
-                log.info("draining for at most %g s, a second signal leaves at once: running episodes finish, queued "
-                         "jobs go back", self._membership.conditions.drain_timeout,
-                         extra={"facts": {"event": "draining"}})  # fmt: skip
+                most = f"{self._membership.conditions.drain_timeout:g} s, a second signal leaves at once"
+                log_event(log, "draining", f"draining for at most {most}: running episodes finish, queued jobs go back")
             if self._membership.is_leaving(now):
                 self._slots.yield_idle_slots()
             else:
@@ -131,7 +131,7 @@ class RunSession:
             if self._membership.must_rejoin(now, self._load()):
                 self._rejoin(now)
             elif self._membership.start_search_if_due(now):
-                self._say_alone()
+                self._say_waiting()
                 self._follow_run()
                 self._say_shut_out()
         return why
@@ -141,9 +141,9 @@ class RunSession:
         self._send_heartbeat(monotonic(), capacity=0, reason=why)
         for each in self._declared:
             each.undeclare()
-        log.info("leaving run %s (%s): %s, %s%s", self._admission.run, why, plural(self._finished, "job"),
-                 plural(self._steps_finished, "environment step"), self._lost_results(),
-                 extra={"facts": {"event": "left", "run": self._admission.run}})  # fmt: skip
+        run, steps = self._admission.run, plural(self._steps_finished, "environment step")
+        done = f"{plural(self._finished, 'job')}, {steps}{self._lost_results()}"
+        log_event(log, "left", f"leaving run {run} ({why}): {done}", run=run)
 
     def _lost_results(self) -> str:
         """Which finished results go with this worker, in words."""
@@ -186,33 +186,35 @@ class RunSession:
             self._membership.remove_coordinator(nonce, monotonic())
             if self._membership.run_is_over:
                 return  # it ended the run and left, as it said
-            self._say_alone()
+            self._say_waiting()
             return
-        self._said_alone = self._said_shut_out = False
-        if self._membership.add_coordinator(nonce):  # joining another life is logged by `_rejoin`
-            log.info("the coordinator of run %s is back; this worker continues", self._admission.run,
-                     extra={"facts": {"event": "coordinator back", "run": self._admission.run}})  # fmt: skip
+        self._said_waiting = self._said_shut_out = False
+        if self._membership.add_coordinator(nonce):  # joining another incarnation is logged by `_rejoin`
+            run = self._admission.run
+            log_event(log, "coordinator back", f"the coordinator of run {run} is back; this worker continues", run=run)
 
-    def _say_alone(self) -> None:
+    def _say_waiting(self) -> None:
         """Log once that no coordinator is in sight. One that was killed as this worker joined was never in sight."""
-        if not self._said_alone:
-            self._said_alone = True
-            log.info("the coordinator of run %s left or cannot be reached; this worker %s",
-                     self._admission.run, self._membership.plan_without_coordinator,
-                     extra={"facts": {"event": "coordinator gone", "run": self._admission.run}})  # fmt: skip
+        if not self._said_waiting:
+            self._said_waiting = True
+            run, plan = self._admission.run, self._membership.plan_without_coordinator
+            text = f"the coordinator of run {run} left or cannot be reached; this worker {plan}"
+            log_event(log, "coordinator gone", text, run=run)
 
     def _say_shut_out(self) -> None:
         """Log once that a secured router shows this worker no coordinator: to a revoked one it shows nothing."""
         if self._link.secured and not self._said_shut_out and list(self._link.session.info.routers_zid()):
             self._said_shut_out = True
-            log.warning("a router answers, and shows this worker no coordinator of run %s: if the run is served, the "
-                        "join file of %s was revoked; have another issued", self._admission.run, self._link.identity,
-                        extra={"facts": {"event": "shut out", "run": self._admission.run}})  # fmt: skip
+            text = (
+                f"a router answers, and shows this worker no coordinator of run {self._admission.run}: if the run is "
+                f"served, the join file of {self._link.identity} was revoked; have another issued"
+            )
+            log_event(log, "shut out", text, level=logging.WARNING, run=self._admission.run)
 
     def _handle_batch(self, payload: bytes) -> None:
         """Handle jobs, cancellations and verdicts.
 
-        R12: a batch of another life or of an older numbering is ignored, because the coordinator has said its content
+        R12: a batch of another incarnation or of an older numbering is ignored: the coordinator has said its content
         again since. A batch of a newer numbering only makes this worker say hello.
         R9: a cancelled job stops at its next step, so that no slot works for nothing.
         """
@@ -299,17 +301,17 @@ class RunSession:
         restarted = self._adopt(admission)
         self._membership.rejoin(admission.nonce, monotonic())
         level = logging.INFO if restarted else logging.DEBUG  # an idle worker of a paused run says hello repeatedly
-        log.log(level, "joined run %s again, incarnation %d", admission.run, admission.incarnation,
-                extra={"facts": {"event": "rejoined", "run": admission.run}})  # fmt: skip
+        text = f"joined run {admission.run} again, incarnation {admission.incarnation}"
+        log_event(log, "rejoined", text, level=level, run=admission.run)
         self._note_version()
 
     def _note_version(self) -> None:
         """Log once for each version of the coordinator that it is not this worker's."""
         run, version, own = self._admission.run, self._admission.package, package_version("dreamfleet")
         if version not in (own, self._coordinator_version):
-            log.warning("run %s is of dreamfleet %s, and this worker of %s: install %s here and start the worker again",
-                        run, version, own, version,
-                        extra={"facts": {"event": "other version", "run": run, "package": version}})  # fmt: skip
+            these = f"run {run} is of dreamfleet {version}, and this worker of {own}"
+            text = f"{these}: install {version} here and start the worker again"
+            log_event(log, "other version", text, level=logging.WARNING, run=run, package=version)
         self._coordinator_version = version
 
     def _follow_run(self) -> None:
@@ -337,7 +339,7 @@ class RunSession:
         self._startup()
 
     def _adopt(self, admission: Admission) -> bool:
-        """Go on under another admission to the same run; return whether its coordinator is in another life.
+        """Go on under another admission to the same run; return whether its coordinator is in another incarnation.
 
         R12: under a new numbering of batches the coordinator gives the queued jobs again, so they are dropped here.
         R7: every result without a verdict is sent again at once, because the coordinator may not have the last sending.

@@ -45,7 +45,7 @@ class StepRate:
 
 
 class CoordinatorSender:
-    """Sends to the one life of a coordinator that `admission` names."""
+    """Sends to the one incarnation of a coordinator that `admission` names."""
 
     def __init__(self, session: zenoh.Session, identity: str, admission: Admission) -> None:
         self._session = session
@@ -85,7 +85,7 @@ class CoordinatorSender:
             host_class=slots.host_class,
             reason=reason,
             taken=min(slots.taken, capacity),
-            together=slots.together,
+            side_by_side=slots.side_by_side,
         )
 
     def send_farewell(self, slots: int, reason: str) -> None:

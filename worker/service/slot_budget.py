@@ -15,7 +15,7 @@ from threading import Lock
 from time import monotonic
 
 QUANTUM = 0.25  # slot seconds by which a run may be ahead of a waiting one, so that short jobs need not alternate
-PATIENCE = 0.1  # seconds for which a free slot waits for the run whose turn it is
+TIMEOUT = 0.1  # seconds for which a free slot waits for the run whose turn it is
 RECENT = 2.0  # seconds after its last job for which a run counts as one that needs its share
 GAP_CREDIT = 10.0  # slot seconds that a run is still owed after a gap below `RECENT`, as between two generations
 
@@ -113,7 +113,7 @@ class SlotBudget:
     def _may_take(self, run: int, now: float) -> bool:
         """Whether a slot is free for a run.
 
-        A run that goes first and takes nothing for `PATIENCE` seconds does not count until it settles again: its thread
+        A run that goes first and takes nothing for `TIMEOUT` seconds does not count until it settles again: its thread
         may be waiting for a coordinator that does not answer.
         """
         free = self._slots - sum(each.held for each in self._accounts.values())
@@ -122,7 +122,7 @@ class SlotBudget:
         first = self._ahead_of(run)
         for each in first:
             each.offered_at = now if each.offered_at is None else each.offered_at
-            if now - each.offered_at > PATIENCE:
+            if now - each.offered_at > TIMEOUT:
                 each.wanted = 0
         return sum(each.wanted for each in first) < free
 

@@ -108,7 +108,7 @@ class SlotPool:
         return min(min(self.ready_count, self._share.allowance) * self._jobs_a_slot, MAX_LEASES // 2)
 
     @property
-    def together(self) -> int:
+    def side_by_side(self) -> int:
         """Candidates' drives that a slot does side by side."""
         return self._drive_count.best
 
@@ -197,7 +197,7 @@ class SlotPool:
         slot = self._slots[event.slot]
         if isinstance(event.message, ChildReady):
             self.host_class = self.host_class or event.message.host_class
-            self._drive_count.most = event.message.together
+            self._drive_count.most = event.message.side_by_side
         if event.failure is not None:
             # A child that is not ready yet has started no job, so none is named.
             text = self._failures.format_if_new(event.failure, self._task, slot.running if slot.ready else ())
@@ -263,7 +263,7 @@ class SlotPool:
     @property
     def _jobs_a_slot(self) -> int:
         """Candidates' jobs that a slot scores at once."""
-        return self._batch_size or self.together
+        return self._batch_size or self.side_by_side
 
     def _measure(self, jobs: Sequence[Job], results: Sequence[Result]) -> None:
         """Note how long a group took, if all its jobs were candidates' and none failed."""

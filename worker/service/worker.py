@@ -23,6 +23,7 @@ from dreamfleet.common.errors import (
     HandshakeRejectedError,
     RefusedError,
 )
+from dreamfleet.common.host.logs import log_event
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import CountingDecoder
@@ -90,8 +91,8 @@ class Worker:
             find_task(name)  # fails now, rather than after a run has accepted this worker
         self.identity = keys.new_worker_identity(config.name)
         if network.credentials is not None:
-            label, _, life = self.identity.partition("/")
-            self.identity = f"{add_seat_to_name(label, network.credentials)}/{life}"
+            label, _, process = self.identity.partition("/")
+            self.identity = f"{add_seat_to_name(label, network.credentials)}/{process}"
         self.inbox = CountingDecoder()
         self._config = config
         self._network = network
@@ -155,15 +156,15 @@ class Worker:
                 why = str(error)
                 rejections[why] += 1
                 if rejections[str(error)] == 2:  # a coordinator that just started accepts the next try
-                    log.warning("%s; trying again", error, extra={"facts": {"event": "rejected"}})
+                    log_event(log, "rejected", f"{error}; trying again", level=logging.WARNING)
             except ConnectionFailedError:
                 if text := waiting.next(monotonic(), answered=False):
-                    log.warning("%s", text, extra={"facts": {"event": "no coordinator"}})
-            self._check_patience(why)
+                    log_event(log, "no coordinator", text, level=logging.WARNING)
+            self._check_waiting_time(why)
             self._pause()
         return None
 
-    def _check_patience(self, why: str = "") -> None:
+    def _check_waiting_time(self, why: str = "") -> None:
         """`ConnectionFailedError` if it leaves with its run, and no coordinator let it in for too long; `why` if known.
 
         R24: such a worker ends by itself, also where its run ended before it came.
@@ -313,7 +314,7 @@ class Worker:
                     self._handle_refusal("", error)
             if pause > FIRST_RETRY:
                 self._log_waiting()
-            self._check_patience()
+            self._check_waiting_time()
             self._pause(pause)
             pause = min(2 * pause, RETRY)
         return None
@@ -356,8 +357,8 @@ class Worker:
         refuser = self._refusal_key(run)
         pause = self._refusals.add(refuser, monotonic())
         if self._refusals.is_news(refuser, str(error)):
-            log.warning("%s; asking again in %.0f s, then with growing pauses", error, pause,
-                        extra={"facts": {"event": "refused", "run": run}})  # fmt: skip
+            text = f"{error}; asking again in {pause:.0f} s, then with growing pauses"
+            log_event(log, "refused", text, level=logging.WARNING, run=run)
 
     def _refusal_key(self, run: str) -> str:
         """The key of a refusal in `RefusalBackoff`: a worker of one run remembers only one."""

@@ -3,7 +3,7 @@
 __all__ = [
     "api",
     "registry",
-    "policy",
+    "model_free_policies",
     "pictures",
     "measures",
     "recordable",

@@ -19,7 +19,7 @@ from dreamfleet.common.artifacts.actions import Actions, Continuous, Discrete, M
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.tasks import Description
 from dreamfleet.worker.tasks.assignment import Assignment
-from dreamfleet.worker.tasks.policy import Driver, FlatPolicy
+from dreamfleet.worker.tasks.model_free_policies import Driver, FlatPolicy
 from dreamfleet.worker.tasks.world import ENVIRONMENT_LIMIT, DreamReward, World
 
 __all__ = [

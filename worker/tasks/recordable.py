@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.worker.tasks.api import Policy, Task
-from dreamfleet.worker.tasks.policy import Driver
+from dreamfleet.worker.tasks.model_free_policies import Driver
 from dreamfleet.worker.tasks.world import World
 
 

@@ -24,7 +24,7 @@ from dreamfleet.common.transport.session import Network
 
 POLL = 1.0  # seconds between two looks at a batch of which no event arrives
 RETRY = 0.25  # seconds until a coordinator that did not answer is asked again
-PATIENCE = 600.0  # seconds without an answer after which a coordinator counts as gone
+TIMEOUT = 600.0  # seconds without an answer after which a coordinator counts as gone
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,13 @@ class RemoteScorer(Displayed):
     ...         scorer.score(np.zeros((2, scorer.size)), seeds=[1, 2]).shape
     (2,)
 
-    `patience` is how many seconds it waits for a coordinator that does not answer, because it was killed and is being
+    `timeout` is how many seconds it waits for a coordinator that does not answer, because it was killed and is being
     resumed. Then, and if the address is wrong, `ConnectionFailedError`.
     """
 
-    def __init__(self, connect: Network | tuple[str, ...] | str, run: str, *, patience: float = PATIENCE) -> None:
+    def __init__(self, connect: Network | tuple[str, ...] | str, run: str, *, timeout: float = TIMEOUT) -> None:
         self.run = run
-        self.patience = patience
+        self.timeout = timeout
         self._client = Client(connect)
         self._batches = BatchClient(self._client)
         self._changed = threading.Condition()
@@ -114,8 +114,8 @@ class RemoteScorer(Displayed):
         return self.persist(lambda: self._batches.cancel(self.run, batch_id))
 
     def persist(self, ask: Callable[[], BatchReply]) -> BatchReply:
-        """Repeat a query until a coordinator answers that is not too busy; the last error after `patience` seconds."""
-        deadline = monotonic() + self.patience
+        """Repeat a query until a coordinator answers that is not too busy; the last error after `timeout` seconds."""
+        deadline = monotonic() + self.timeout
         while True:
             try:
                 return ask()

@@ -41,7 +41,7 @@ Floats = NDArray[np.float32]
 class LiveFrame:
     """A decoded frame: its worker, and its contents as arrays; `None` for contents that it lacks."""
 
-    worker: str  # name/life
+    worker: str  # name/process
     frame: ViewFrame
     picture: NDArray[np.uint8] | None = field(repr=False)  # (height, width, 3)
     latent: Floats | None = field(repr=False)
@@ -63,7 +63,7 @@ class LiveView:
     """
 
     def __init__(self, client: Client, run: str | None = None, worker: str | None = None) -> None:
-        """`run` may be omitted if only one is live. `worker` is a name or `name/life`; by default the busiest worker.
+        """`run` may be omitted if only one is live. `worker` is a name or `name/process`; by default the busiest.
 
         `UsageError` for an unknown worker lists those of the run.
         """

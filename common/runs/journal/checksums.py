@@ -44,7 +44,7 @@ _REST = (
     "SELECT generation, vector, episodes FROM collection ORDER BY generation",
     "SELECT count(*), max(number) FROM generation",
     "SELECT outcome, count(*) FROM verification GROUP BY 1 ORDER BY 1",
-    "SELECT host, why, by_anchor, by_operator FROM barred ORDER BY host",
+    "SELECT host, why, by_trusted, by_operator FROM barred ORDER BY host",
     "SELECT because, count(*) FROM recalled GROUP BY 1 ORDER BY 1",
     "SELECT digest, kind, generation, candidate, episode, seed, error, cause, fault FROM failure ORDER BY digest",
 )

@@ -9,7 +9,7 @@ from functools import cache
 from dreamfleet.common.errors import DamagedJournalError, JournalError
 
 APPLICATION_ID = 0x64666C74  # "dflt": marks the SQLite file as ours
-VERSION = 11
+VERSION = 12
 # Results lie in the order in which they come, so a commit changes few pages, however long the run is.
 TABLES = """
     CREATE TABLE run (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
@@ -54,7 +54,7 @@ TABLES = """
     ) STRICT;
     CREATE INDEX verification_digest ON verification (digest);
     CREATE TABLE barred (
-        host TEXT PRIMARY KEY, why TEXT NOT NULL, by_anchor INTEGER NOT NULL, incarnation INTEGER NOT NULL,
+        host TEXT PRIMARY KEY, why TEXT NOT NULL, by_trusted INTEGER NOT NULL, incarnation INTEGER NOT NULL,
         happened REAL NOT NULL, by_operator INTEGER NOT NULL DEFAULT 0
     ) STRICT, WITHOUT ROWID;
     CREATE TABLE recalled (

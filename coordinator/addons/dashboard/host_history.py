@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.printable import printable
-from dreamfleet.common.runs.records import StoredEvent, StoredWork
+from dreamfleet.common.runs.records import StoredEvent, WorkerEffort
 
 BINS = 120  # of the run's time
 MOST_HOSTS = 200  # in the document; the others are summed
@@ -33,7 +33,7 @@ class _Host:
 
 
 def host_history(
-    work: Sequence[StoredWork], times: Times, events: Sequence[StoredEvent], until: float | None
+    work: Sequence[WorkerEffort], times: Times, events: Sequence[StoredEvent], until: float | None
 ) -> dict[str, Any]:
     """The JSON document; `until` is the run's end, or now if it is live, in seconds since 1970; `None`: unknown."""
     moments = [each for pair in times.values() for each in pair if each is not None]
@@ -71,12 +71,12 @@ def host_history(
 class _Spans:
     """When work was done, as far as the journal says: from and until."""
 
-    def __init__(self, work: Sequence[StoredWork], times: Times, end: float) -> None:
+    def __init__(self, work: Sequence[WorkerEffort], times: Times, end: float) -> None:
         self._times, self._end = times, end
         self._last = max((closed for _, closed in times.values() if closed is not None), default=end)
         self._besides = sorted({each.generation for each in work if each.kind != "score" and not each.confirming})
 
-    def __call__(self, work: StoredWork) -> tuple[float, float]:
+    def __call__(self, work: WorkerEffort) -> tuple[float, float]:
         """Candidates: while their generation was open. A mean: in idle slots, until the next one's turn."""
         if work.confirming:
             return self._last, self._end

@@ -28,7 +28,7 @@ from dreamfleet.coordinator.addons.dashboard.stored_runs import describe_archive
 from dreamfleet.coordinator.addons.web.documents import event
 
 ANSWER_TIMEOUT = 1.5  # seconds to wait for answers
-PATIENCE = 5.0  # seconds of slow answers after which a silent run is lost; if others answer fast, at once
+TIMEOUT = 5.0  # seconds of slow answers after which a silent run is lost; if others answer fast, at once
 MOST_RUNS = 32  # followed at a time
 MOST_ROWS = 100_000  # generations, evaluations or workers fetched of a run
 
@@ -82,7 +82,7 @@ class Watcher:
             with suppress(ConnectionFailedError):  # it left between two queries
                 self._update_run(name, document, now)
         for each in self._followed.values():
-            if each.name not in answered and (not slow or now - each.heard > PATIENCE):
+            if each.name not in answered and (not slow or now - each.heard > TIMEOUT):
                 each.lost = each.lost or now
         self._receive_final_statuses(now)
         self._forget_oldest()

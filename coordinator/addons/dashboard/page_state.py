@@ -39,7 +39,7 @@ def page_state(look: RunSnapshot) -> dict[str, Any]:
     view = LiveRunView.of_status(status, look.word)
     link = OVER if status.is_over else LIVE if look.lost is None else LOST
     states = {LIVE: status.state, LOST: "coordinator lost", OVER: "ended" if status.state == "ended" else "left open"}
-    stage = [] if view.stage is None else [f"stage {view.stage.number} of {view.stage.total}"]
+    stage = [] if view.stage is None else [f"stage {view.stage.number} of {len(view.settings.stages)}"]
     return {
         "run": status.run, "uid": status.run_uid, "link": link, "stored": look.folder is not None,
         "state": states[link], "sentence": _lost_sentence(look) if link == LOST else _sentence(view),

@@ -76,7 +76,7 @@ def describe_hosts(runs_dir: Path, name: str) -> dict[str, Any]:
             "run": run.name, "state": printable(state), "task": printable(run.spec.task),
             "classes": printable(run.classes.description),
             "checks": "" if run.checks is None else printable(run.checks.description),
-            **host_history(run.work_by_worker(), run.generation_times(), run.events(), until),
+            **host_history(run.effort_by_worker(), run.generation_times(), run.events(), until),
         }  # fmt: skip
 
 

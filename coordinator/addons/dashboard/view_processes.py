@@ -26,7 +26,7 @@ RATE = 10  # pictures a second
 LINGER = 5.0  # seconds until a view without viewers ends: the page may just be reloading
 CHECK_INTERVAL = 0.5  # seconds between checks for viewers
 STALLED = 15.0  # seconds after which a viewer that takes nothing no longer counts
-PATIENCE = 3.0  # seconds for a process to exit after its stream ended
+TIMEOUT = 3.0  # seconds for a process to exit after its stream ended
 MOST_VIEWERS = 200
 LONGEST = 500  # characters of a process's last message
 NICE = ("nice", "-n", "10")  # workers on this host go first
@@ -36,7 +36,7 @@ _NUMBER = re.compile(r"\d{1,9}")
 
 @dataclass(frozen=True)
 class ViewTarget:
-    """What a view shows: a worker by `name/life`, the best mean, a generation's mean, or the busiest worker."""
+    """What a view shows: a worker by `name/process`, the best mean, a generation's mean, or the busiest worker."""
 
     run: str
     kind: str = ""
@@ -48,7 +48,7 @@ class ViewTarget:
         run, worker, generation = keys.check_run_name(asked.get("run", "")), asked.get(WORKER), asked.get(GENERATION)
         if worker is not None:
             if not keys.is_worker_identity(worker):
-                raise UsageError("worker must be name/life, as the page shows it")
+                raise UsageError("worker must be name/process, as the page shows it")
             return cls(run, WORKER, worker)
         if generation is not None:
             if not _NUMBER.fullmatch(generation):
@@ -183,7 +183,7 @@ class _ViewProcess:
     def _stop_process(self) -> None:
         """In a thread: wait for a process whose stream ended; kill any other, which has nothing to lose."""
         if self._ended.is_set():
-            self._child.wait(PATIENCE)
+            self._child.wait(TIMEOUT)
         self._child.end(timeout=0)
 
     def _read(self, stream: IO[bytes]) -> None:

@@ -12,7 +12,7 @@ from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.transport.network import parse_metrics_address
 from dreamfleet.coordinator.service.snapshot import Snapshot
 
-PATIENCE = 5.0  # seconds for a request and its response: the server handles one client at a time
+TIMEOUT = 5.0  # seconds for a request and its response: the server handles one client at a time
 POLL = 0.1  # seconds
 LONGEST = 90.0  # seconds that an ended run waits for its scraper to see that it ended
 
@@ -75,13 +75,13 @@ def _handler(snapshot: Callable[[], Snapshot]) -> type[BaseHTTPRequestHandler]:
     from dreamfleet.coordinator.addons.metrics.prometheus import CONTENT_TYPE, exposition  # only where they are served
 
     class Handler(BaseHTTPRequestHandler):
-        timeout = PATIENCE
+        timeout = TIMEOUT
         server_version = "dreamfleet"
         sys_version = ""
 
         def handle(self) -> None:
             """Handle one request; a slow client is cut off, for it would block others and the coordinator's exit."""
-            late = threading.Timer(PATIENCE, self._drop)
+            late = threading.Timer(TIMEOUT, self._drop)
             late.daemon = True
             late.start()
             try:

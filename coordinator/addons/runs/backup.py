@@ -122,7 +122,7 @@ def _copy_controller_and_journal(source: RunFolder, folder: Path) -> None:
 
 
 def _recalls(run: RunFolder) -> tuple[object, ...]:
-    """What differs once results were recalled: each recall bars hosts, and ends a life of the coordinator."""
+    """What differs once results were recalled: each recall bars hosts, and ends an incarnation of the coordinator."""
     checks = run.checks
     return run.fact("incarnation"), checks and (checks.barred, checks.recalled)
 

@@ -33,7 +33,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run_name", nargs="?", metavar="RUN", help="name of the run (default: the only live one)")
     parser.add_argument("--journal", action="store_true", help="read RUN's journal on this disk, even if it is live")
     which = parser.add_mutually_exclusive_group()
-    which.add_argument("--worker", metavar="W", help="of this worker, or of all lives of this host's worker")
+    which.add_argument("--worker", metavar="W", help="of this worker, or of all worker processes of this host's worker")
     which.add_argument("--job", metavar="G/I", help="of this candidate's jobs: generation/index, such as 3/0")
     parser.add_argument(
         "--what", nargs="+", metavar="WORD", default=(), choices=get_args(EventKind),
@@ -98,8 +98,8 @@ def _print_journal(args: argparse.Namespace) -> int:
         found: dict[str, list[Any]] = {"events": events, "failures": failures}
         print(json.dumps({name: [asdict(each) for each in rows] for name, rows in found.items()}))
         return 0
-    print_rows([{"time (UTC)": _format_time(each.happened), "life": each.incarnation, "event": each.text}
-                for each in events], right=("life",))  # fmt: skip
+    print_rows([{"time (UTC)": _format_time(each.happened), "incarnation": each.incarnation, "event": each.text}
+                for each in events], right=("incarnation",))  # fmt: skip
     return 0
 
 

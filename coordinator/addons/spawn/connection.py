@@ -31,7 +31,7 @@ MAX_LINE = 1 << 20  # bytes of an answer, and of all that a host prints beside i
 MAX_PROGRESS = 1000  # messages of a request's progress
 MAX_RENEWALS = 4  # times its `silence` that a request may report progress instead of an answer
 QUICK, SLOW = 60.0, 1800.0  # seconds of silence: of an agent that starts or looks, of one that installs or drains
-PATIENCE = 5.0  # seconds for ssh to exit
+EXIT_TIMEOUT = 5.0  # seconds for ssh to exit
 FORWARD = 30.0  # seconds for ssh to report the tunnel's port once the agent runs
 _PORT = re.compile(r"Allocated port (\d+) for remote forward to (\S+)")
 _BRACKETS = str.maketrans("", "", "[]")  # of an IPv6 address
@@ -87,7 +87,7 @@ class Connection:
 
     def start_agent(self) -> None:
         """Start the agent and wait for it; `close` from another thread ends the wait."""
-        with self._patience(QUICK):
+        with self._silence_limit(QUICK):
             self._send(self._program)
         self._answer(QUICK, lambda _kind, _text: None)
 
@@ -97,7 +97,7 @@ class Connection:
     ) -> T:  # fmt: skip
         """Send a request and return its answer; `DreamfleetError` if it failed, or after so much `silence`."""
         names = [(name, len(data)) for name, data in sent.items()]
-        with self._patience(silence):
+        with self._silence_limit(silence):
             self._send(json.dumps({"do": do, "files": names, **facts}).encode() + b"\n", *sent.values())
         try:
             return from_plain(answer, self._answer(silence, on_message))
@@ -122,7 +122,7 @@ class Connection:
 
     def close(self) -> None:
         """Close the connection, which ends workers that use its tunnel. From any thread."""
-        self._child.end(PATIENCE)
+        self._child.end(EXIT_TIMEOUT)
         if self._child.popen.stdin is not None:
             with suppress(OSError):  # what was not read is lost with it
                 self._child.popen.stdin.close()
@@ -139,7 +139,7 @@ class Connection:
         messages = ("failed", "say", "line") if silence is None else ("failed", "say")
         progress, until = 0, math.inf if silence is None else monotonic() + MAX_RENEWALS * silence
         while True:
-            with self._patience(silence):
+            with self._silence_limit(silence):
                 kind, content = self._read_message()
             if kind == "ok" and isinstance(content, dict):
                 return content
@@ -174,7 +174,7 @@ class Connection:
         raise self._failure()
 
     @contextmanager
-    def _patience(self, silence: float | None) -> Iterator[None]:
+    def _silence_limit(self, silence: float | None) -> Iterator[None]:
         """End the connection if the block takes longer; `None`: it may take forever."""
         if silence is None:
             yield
@@ -198,8 +198,8 @@ class Connection:
     def _failure(self) -> ConnectionFailedError:
         if self._fault:
             return ConnectionFailedError(self._fault)
-        self._child.wait(PATIENCE)
-        self._listener.join(PATIENCE)
+        self._child.wait(EXIT_TIMEOUT)
+        self._listener.join(EXIT_TIMEOUT)
         return ConnectionFailedError(explain(list(self._stderr_lines), self._child.exit_code, self._address))
 
     def _listen(self) -> None:

@@ -163,11 +163,11 @@ def _facts(view: LiveRunView) -> Iterator[tuple[int, str, str]]:
     """Priority (0 is highest), name and value of each fact, in display order."""
     status, stage = view.status, view.stage
     temperature, waste = status.generation.temperature, status.waste
-    warm = "" if temperature is None or (stage or view.settings).driven == 1 else f", temperature {temperature:g}"
+    warm = "" if temperature is None or view.stage_settings.driven == 1 else f", temperature {temperature:g}"
     yield 6, "task", view.about + warm
     yield 7, "population", view.population
     if stage is not None:
-        yield 4, "stage", f"{stage.number} of {stage.total}, since generation {stage.since}"
+        yield 4, "stage", f"{stage.number} of {len(view.settings.stages)}, since generation {stage.since}"
     last = "-" if view.last is None else f"average {format_number(view.last.mean)}, {view.spread}"
     yield 0, "last generation", last
     if view.settings.is_external:

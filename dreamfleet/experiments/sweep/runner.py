@@ -30,7 +30,7 @@ from dreamfleet.experiments.sweep.plan import SweepRun, staggered_share
 
 STATUS_INTERVAL = 2.0  # seconds between two looks at all runs
 RESTART_PAUSE = 5.0  # seconds of life after which a worker or router that was killed is started again
-PAUSE_PATIENCE = 30.0  # seconds for which a run may pause by itself: a full disk or a host may get better
+PAUSE_TIMEOUT = 30.0  # seconds for which a run may pause by itself: a full disk or a host may get better
 FULL_DISK = 1 << 20  # bytes that are left of a disk on which a coordinator cannot even say so
 MOST_RESTARTS = 3  # of a run's coordinator that was killed
 
@@ -185,7 +185,7 @@ class SweepRunner:
                 each.paused_since = None
             elif each.paused_since is None:
                 each.paused_since = self._looked_at
-            elif self._looked_at - each.paused_since > PAUSE_PATIENCE:
+            elif self._looked_at - each.paused_since > PAUSE_TIMEOUT:
                 each.state, each.text = "failed", barred or f"paused: {status.get('why')}"
                 self._coordinators[each.run.name].ask_to_end()
 

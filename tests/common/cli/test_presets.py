@@ -10,7 +10,7 @@ from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.cli.presets import NAMES, check_preset
 from dreamfleet.common.errors import UsageError
 from dreamfleet.coordinator.settings import presets as runs
-from dreamfleet.coordinator.settings.schedule import split_first_stage
+from dreamfleet.coordinator.settings.stage_tables import split_first_stage
 from dreamfleet.coordinator.verbs import coordinator
 from dreamfleet.worker.addons.baselines import presets as baselines
 from dreamfleet.worker.addons.baselines import verb as baseline

@@ -57,7 +57,7 @@ def test_jobs_of_a_silent_worker_are_logged_as_given_again(bench):
     assert events(bench, worker="a")[-1][:2] == ("back", A)
 
 
-def test_a_worker_that_vanishes_is_logged_and_a_stranger_is_not(bench):
+def test_a_worker_that_vanishes_is_logged_and_an_unknown_sender_is_not(bench):
     bench.run.fleet.handle_departure(B, bench.now)
     bench.wait(2 * DEPARTURE_GRACE)
     assert ("lost", B, "") in events(bench)

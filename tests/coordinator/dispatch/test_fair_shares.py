@@ -19,7 +19,7 @@ def beat(fleet, name, now):
     """The worker shows all that it was given; its first evaluation runs, else all of its dreams."""
     member = fleet.members[name]
     first = next(iter(member.leases), None)
-    runs = [each for each in member.leases if each == first or not fleet.jobs[first].work.job.runs_alone]
+    runs = [each for each in member.leases if each == first or not fleet.jobs[first].work.job.is_background]
     waits = [each for each in member.leases if each not in runs]
     shown = dispatched.beat(WIDTH, member.number, member.numbering, queued=waits, running=runs, steps=1)
     fleet.handle_heartbeat(name, replace(shown, slots=1), now)

@@ -9,10 +9,16 @@ from msgspec.structs import replace
 
 from dreamfleet.common.protocol.messages import MAX_SLOTS, Result
 from dreamfleet.coordinator.dispatch.event_log import latest
-from dreamfleet.coordinator.dispatch.fleet import DEPARTURE_GRACE, FORGET_AFTER, GUEST_TIMEOUT, MAX_GUESTS, SILENT_AFTER
+from dreamfleet.coordinator.dispatch.fleet import (
+    DEPARTURE_GRACE,
+    FORGET_AFTER,
+    MAX_UNCONFIRMED,
+    SILENT_AFTER,
+    UNCONFIRMED_TIMEOUT,
+)
 from dreamfleet.coordinator.dispatch.member import DEPARTED_TIMEOUT, MAX_DEPARTED
 from dreamfleet.coordinator.dispatch.speculative_execution import LONGEST_HELD, LONGEST_HELD_TIMES, UPLOAD_SECONDS
-from dreamfleet.coordinator.jobs.work import make_work, vector_bytes
+from dreamfleet.coordinator.jobs.scoring_job import make_jobs, vector_bytes
 from tests.support.dispatched import BEAT, A, B, Fleet, beat, digests, fleet_of, join, result, work
 from tests.support.failures import failure
 from tests.support.samples import SPEC
@@ -46,20 +52,20 @@ def test_credit_is_twice_the_capacity_from_the_first_heartbeat_on_and_a_result_r
 def test_of_drives_a_wide_worker_is_given_as_many_as_its_slots_do_at_once_and_once_more(driven, together, given):
     fleet = fleet_of(A, jobs=0)
     spec = SPEC.with_overrides(driven=driven)
-    fleet.jobs.offer(make_work(spec, "score", 0, 0, vector_bytes(np.arange(4.0)), range(1000, 1050), SPEC))
-    fleet.handle_heartbeat(A, replace(beat(capacity=200), slots=2, together=together), 1.0)
+    fleet.jobs.offer(make_jobs(spec, "score", 0, 0, vector_bytes(np.arange(4.0)), range(1000, 1050), SPEC))
+    fleet.handle_heartbeat(A, replace(beat(capacity=200), slots=2, side_by_side=together), 1.0)
     assert len(digests(fleet.dispatch(1.0), A)) == given
 
 
 def test_as_drives_run_out_a_job_that_waits_behind_one_goes_to_an_idle_slot():
     fleet = fleet_of(A, jobs=0)
-    fleet.handle_heartbeat(A, replace(beat(4), slots=1, together=4), 0.0)
+    fleet.handle_heartbeat(A, replace(beat(4), slots=1, side_by_side=4), 0.0)
     fleet.jobs.offer(work(2, generation=1))
     first, second = digests(fleet.dispatch(0.0), A)
     fleet.add_worker(B, 1, "f", 1.0)
-    fleet.handle_heartbeat(B, replace(beat(4), slots=1, together=4), 1.0)
+    fleet.handle_heartbeat(B, replace(beat(4), slots=1, side_by_side=4), 1.0)
     shown = beat(4, seen=1, queued=[second], running=[first])
-    fleet.handle_heartbeat(A, replace(shown, slots=1, together=4), 1.1)
+    fleet.handle_heartbeat(A, replace(shown, slots=1, side_by_side=4), 1.1)
     sends = fleet.dispatch(1.1)
     assert digests(sends, B) == [second]
     assert cancelled(sends, A) == [second]
@@ -130,7 +136,7 @@ def test_a_worker_that_says_why_it_leaves_is_listed_with_that_and_its_jobs_are_f
     assert not fleet.departed, "it is back"
 
 
-def test_a_guest_that_cannot_score_says_why_in_its_first_heartbeat():
+def test_an_unconfirmed_worker_that_cannot_score_says_why_in_its_first_heartbeat():
     fleet = fleet_of(B, jobs=1)
     fleet.add_worker(A, 1, "f", 1.0)
     fleet.handle_heartbeat(A, beat(0, reason="no environment"), 1.0)
@@ -142,7 +148,7 @@ def test_a_guest_that_cannot_score_says_why_in_its_first_heartbeat():
     assert list(fleet.departed) == [A]
 
 
-def test_a_strangers_farewell_in_the_name_of_a_live_worker_ends_with_its_next_heartbeat():
+def test_an_unknown_senders_farewell_in_the_name_of_a_live_worker_ends_with_its_next_heartbeat():
     fleet = fleet_of(A)
     fleet.handle_heartbeat(A, beat(0, reason="forged"), 1.0)
     fleet.tick(1.0 + 2 * DEPARTURE_GRACE)
@@ -234,13 +240,13 @@ def test_an_unconfirmed_batch_is_sent_again_under_its_number():
 
 
 @pytest.mark.parametrize(
-    ("other", "taker"), [("idle", B), ("busy", None), ("a guest", A), ("held back", A), ("not ready", A)]
+    ("other", "taker"), [("idle", B), ("busy", None), ("unconfirmed", A), ("held back", A), ("not ready", A)]
 )
 def test_a_failed_job_goes_to_another_worker_or_waits_for_it_if_it_can_take_jobs_at_all(other, taker):
     fleet = fleet_of(A, jobs=1)
     (digest,) = digests(fleet.dispatch(0.0), A)
     fleet.add_worker(B, 1, "f", 0.0)
-    if other != "a guest":
+    if other != "unconfirmed":
         fleet.handle_heartbeat(B, beat(0 if other == "not ready" else 1), 0.0)
         fleet.members[B].is_held = other == "held back"
     if other == "busy":
@@ -418,18 +424,18 @@ def test_memory_stays_flat_through_a_hundred_thousand_generations_of_churn():
     assert set(fleet.members) == {A}
 
 
-def test_guests_without_a_heartbeat_are_few_and_soon_forgotten():
+def test_workers_without_a_heartbeat_are_few_and_soon_forgotten():
     fleet = fleet_of(A)
     for number in range(20_000):
         fleet.add_worker(f"stranger/{number:08x}", 2**62, "f", 1.0)
-    assert len(fleet.members) == 1 + MAX_GUESTS
+    assert len(fleet.members) == 1 + MAX_UNCONFIRMED
     assert max(member.slots for member in fleet.members.values()) == MAX_SLOTS
-    for now in range(1, int(GUEST_TIMEOUT) + 3):
+    for now in range(1, int(UNCONFIRMED_TIMEOUT) + 3):
         fleet.handle_heartbeat(A, beat(), float(now))
         fleet.tick(float(now))
     assert set(fleet.members) == {A}
     assert [(each.what, each.worker) for each in fleet.notes] == [("joined", A)], (
-        "strangers cannot fill the log with names"
+        "unknown senders cannot fill the log with names"
     )
 
 
@@ -470,7 +476,7 @@ def test_an_idle_worker_gets_an_empty_batch_now_and_then_while_it_is_heard():
 
 def test_a_large_batch_has_the_time_that_its_link_takes():
     fleet = fleet_of(A, jobs=0)
-    fleet.jobs.offer(make_work(SPEC, "score", 0, 0, vector_bytes(np.arange(90_000.0)), [1000]))
+    fleet.jobs.offer(make_jobs(SPEC, "score", 0, 0, vector_bytes(np.arange(90_000.0)), [1000]))
     parts = fleet.dispatch(0.0)
     for second in range(1, 8):  # 360 kB at 50 kB a second
         fleet.handle_heartbeat(A, beat(seen=second), float(second))
@@ -525,21 +531,21 @@ def test_a_result_counts_from_the_life_that_was_given_its_job_and_from_nobody_el
     fleet = fleet_of(A, B, jobs=2)
     sends = fleet.dispatch(0.0)
     (of_a,), (of_b,) = digests(sends, A), digests(sends, B)
-    for stranger in ("x/0badc0de", "a/0badc0de"):
-        assert fleet.handle_result(stranger, result(of_a, fitness=1e9), 0.1) == ("refused", None)
+    for sender in ("x/0badc0de", "a/0badc0de"):
+        assert fleet.handle_result(sender, result(of_a, fitness=1e9), 0.1) == ("refused", None)
     assert fleet.handle_result(B, result(of_a, fitness=1e9), 0.1) == ("refused", None)
     fleet.handle_heartbeat(B, beat(seen=1, running=[of_b], unacked=[of_a]), 0.2)
     assert list(fleet.members[B].leases) == [of_b], "nor is it taken up because somebody shows it"
     assert fleet.handle_result(A, result(of_a), 0.3)[0] == "accepted"
     (verdict,) = [each for send in fleet.dispatch(0.3) if send.identity == B for each in send.verdicts]
     assert (verdict.digest, verdict.verdict) == (of_a, "refused")
-    assert fleet.dropped == {"result of a stranger": 2, "result of a job that was not given": 1}
-    assert fleet.counts["discarded_steps"] == 10, "a stranger's steps are not the fleet's"
+    assert fleet.dropped == {"result of an unknown worker": 2, "result of a job that was not given": 1}
+    assert fleet.counts["discarded_steps"] == 10, "its steps are not the fleet's"
 
 
 def test_what_an_earlier_life_gave_counts_after_its_workers_first_heartbeat():
     fleet = Fleet(BEAT)
-    fleet.jobs.previous_epoch_until = 1
+    fleet.jobs.given_before_until = 1
     fleet.jobs.offer([*work(1), *work(1, generation=2)])
     before, since = fleet.jobs
     assert fleet.handle_result(A, result(before), 0.0)[0] == "refused", "nobody has welcomed it yet"

@@ -6,7 +6,7 @@ import pytest
 from dreamfleet.common.protocol.codec import encode
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, JobBatch, Verdict
 from dreamfleet.coordinator.dispatch.packing import pack
-from dreamfleet.coordinator.jobs.work import make_work, vector_bytes
+from dreamfleet.coordinator.jobs.scoring_job import make_jobs, vector_bytes
 from tests.support.samples import HEAD, SPEC
 
 RANDOM = np.random.default_rng(0)
@@ -15,7 +15,7 @@ RANDOM = np.random.default_rng(0)
 def work_of(size, candidates, episodes):
     vectors = [vector_bytes(RANDOM.normal(size=size)) for _ in range(candidates)]
     seeds = range(episodes)
-    return [work for index, vector in enumerate(vectors) for work in make_work(SPEC, "score", 0, index, vector, seeds)]
+    return [work for index, vector in enumerate(vectors) for work in make_jobs(SPEC, "score", 0, index, vector, seeds)]
 
 
 def packed(work=(), cancels=(), verdicts=()):

@@ -22,7 +22,7 @@ def crowd(source):
             stats.record_loss(source.choice([5.0, 500.0]))
         capacity = source.choice([1, 4, 16])
         member = Member(f"w{number}", capacity, "f", 1, 100.0, source.choice([0.0, 90.0]), stats, capacity)
-        member.is_guest, member.is_held = False, source.random() < 0.1
+        member.is_unconfirmed, member.is_held = False, source.random() < 0.1
         for each in range(source.randrange(2 * capacity + 1)):
             lease = Lease(0, member.start_group(100.0), source.random() < 0.1)
             member.add_lease(bytes([number, each]), lease)

@@ -37,26 +37,26 @@ STEADY = "x1 y2 x1 y2"
         # Without a third host both answer once more.
         ("x1 y2", {"present": "xy"}, again("xy")),
         ("x1 y2 x1", {"present": "xy"}, again("y")),
-        # A host that comes round to the other's word was wrong before, an anchor too.
+        # A host that comes round to the other's word was wrong before, a trusted host too.
         ("x1 y2 y1", {}, wrong("y")),
-        ("x1 y2 x2", {"anchors": "x"}, wrong("x")),
+        ("x1 y2 x2", {"trusted": "x"}, wrong("x")),
         # A host that contradicts itself is wrong if the other does not; if both do, nobody is.
         ("x1 y2 x1 y3", {}, wrong("y")),
         ("x1 y2 x3 y4", {}, Decision()),
         # Two that stay with their words wait for a third.
         (STEADY, {}, held("xy")),
-        (STEADY, {"anchors": "xy"}, held("xy")),
+        (STEADY, {"trusted": "xy"}, held("xy")),
         (STEADY, {"others": True}, OTHER),
-        # An anchor is believed against one host and not against two.
-        (STEADY, {"anchors": "x"}, Decision(frozenset("y"), by_anchor=True)),
-        ("x1 y2 z2", {"anchors": "x"}, wrong("x")),
+        # A trusted host is believed against one host and not against two.
+        (STEADY, {"trusted": "x"}, Decision(frozenset("y"), by_trusted=True)),
+        ("x1 y2 z2", {"trusted": "x"}, wrong("x")),
     ],
 )
 def test_what_the_answers_of_hosts_prove(given, more, decision):
     """Each answer is a host and its fitness; by default x, y and z could answer again, and nobody else is here."""
     answers = [Answer(host, float(value), 10, (), float(n)) for n, (host, value) in enumerate(given.split())]
-    found = {"present": "xyz", "others": False, "anchors": ()} | more
-    assert decide(answers, set(found["present"]), found["others"], found["anchors"]) == decision
+    found = {"present": "xyz", "others": False, "trusted": ()} | more
+    assert decide(answers, set(found["present"]), found["others"], found["trusted"]) == decision
 
 
 def test_steps_and_measures_must_be_equal_too():

@@ -1,4 +1,4 @@
-"""Tests generation.py and work.py."""
+"""Tests generation.py and scoring_job.py."""
 
 from dataclasses import replace
 from math import nan
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from dreamfleet.coordinator.jobs import generation as generation_module
 from dreamfleet.coordinator.jobs.generation import Generation
-from dreamfleet.coordinator.jobs.work import vector_bytes
+from dreamfleet.coordinator.jobs.scoring_job import vector_bytes
 from tests.support.samples import SPEC
 
 DREAM = replace(SPEC, task="dream")

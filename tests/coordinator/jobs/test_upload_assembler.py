@@ -78,7 +78,7 @@ def test_a_part_that_cannot_be_one_is_dropped_and_counted(changes, why):
 
 
 @given(st.lists(st.tuples(st.integers(0, 20), st.integers(1, MAX_UPLOAD)), max_size=60))
-def test_what_strangers_open_is_bounded_in_number_and_size(opened):
+def test_what_unknown_senders_open_is_bounded_in_number_and_size(opened):
     uploads = UploadAssembler()
     for number, total in opened:
         part = replace(

@@ -213,7 +213,7 @@ def test_a_new_host_proves_itself_on_a_job_that_was_scored_before(left):
 
 
 def test_a_failing_job_goes_to_the_host_where_it_failed_least(left):
-    """A new host that joins before the one that has scored gets no proof: both are here, and one is known."""
+    """A new host that joins before the one that has scored gets no control job: both are here, and one is known."""
     left.wait()
     left.hosts = [NEW, A]
     left.admit(NEW, A)
@@ -221,7 +221,7 @@ def test_a_failing_job_goes_to_the_host_where_it_failed_least(left):
     assert failed(left) == [2] * GENERATIONS
 
 
-def test_a_new_host_that_fails_the_proof_pauses_the_run(left):
+def test_a_new_host_that_fails_the_control_job_pauses_the_run(left):
     left.fails = lambda job: True
     replace_host(left)
     assert pause_kinds(left) == [PauseKind.NO_ABLE_HOST]
@@ -305,7 +305,7 @@ def test_time_without_workers_or_paused_is_no_time_of_the_run(begin):
 
 def test_a_pause_by_hand_outlives_its_coordinator(begin):
     bench = begin()
-    bench.journal.set_patience(0.05)
+    bench.journal.set_busy_timeout(0.05)
     with closing(sqlite3.connect(bench.path / "journal.sqlite")) as other:
         other.execute("BEGIN IMMEDIATE")
         bench.run.pause(BY_HAND)

@@ -49,7 +49,7 @@ def ended(failing):
 
 
 def live_on(bench):
-    """A further life of the coordinator, to its end."""
+    """A further incarnation of the coordinator, to its end."""
     bench.journal.commit()
     bench.restart()
     bench.serve()

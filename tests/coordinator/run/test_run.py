@@ -41,8 +41,8 @@ def test_a_result_has_no_verdict_before_its_rollout_is_on_disk(bench):
 def test_upload_parts_of_a_job_that_was_not_given_are_dropped_and_counted(bench):
     (name, job), _ = bench.reach_collection()
     part = bench.parts(job)[0]
-    for stranger, each in (("x/0badc0de", part), (name, msgspec.structs.replace(part, digest=b"x" * 32))):
-        bench.upload(stranger, each)
+    for sender, each in (("x/0badc0de", part), (name, msgspec.structs.replace(part, digest=b"x" * 32))):
+        bench.upload(sender, each)
     assert bench.run.dropped == {"unwanted upload": 2}
     assert len(bench.run.background_jobs.rollout_collections.uploads) == 0
 

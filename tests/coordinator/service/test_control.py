@@ -57,7 +57,7 @@ def test_a_pause_by_hand_does_not_hide_why_the_run_was_paused(bench):
 
 
 def test_a_run_whose_results_are_being_recalled_resumes_in_its_next_life_only(bench):
-    """What this life holds is true no more, so nothing of it may reach the journal or a worker."""
+    """What this incarnation holds is true no more, so nothing of it may reach the journal or a worker."""
     bench.run.pause(BY_HAND)
     bench.run.keep_paused()
     assert bench.obey("bar", "a").accepted

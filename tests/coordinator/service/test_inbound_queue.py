@@ -1,7 +1,7 @@
 import queue
 
 from dreamfleet.common.protocol.messages import MAX_MESSAGE
-from dreamfleet.coordinator.service.inbound_queue import HELLO_PATIENCE, QUEUE_LIMITS, InboundQueue, QueueLimit
+from dreamfleet.coordinator.service.inbound_queue import HELLO_LIMIT, QUEUE_LIMITS, InboundQueue, QueueLimit
 
 
 def taken(arrivals):
@@ -42,10 +42,10 @@ def test_hellos_may_arrive_in_a_burst_and_then_at_a_bounded_rate():
 def test_a_hello_waits_for_other_events_but_not_forever():
     arrivals = InboundQueue({"hello": QueueLimit(10, 1000), "beat": QueueLimit(100, 1000)})
     arrivals.put("hello", 0, 1, 0.0)
-    for number in range(2 * HELLO_PATIENCE):
+    for number in range(2 * HELLO_LIMIT):
         arrivals.put("beat", number, 1, 0.0)
     kinds = [kind for kind, _ in taken(arrivals)]
-    assert kinds == ["beat"] * HELLO_PATIENCE + ["hello"] + ["beat"] * HELLO_PATIENCE
+    assert kinds == ["beat"] * HELLO_LIMIT + ["hello"] + ["beat"] * HELLO_LIMIT
 
 
 def test_a_wake_is_never_dropped():

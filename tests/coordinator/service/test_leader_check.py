@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from dreamfleet.common.protocol.messages import ClaimNote
 from dreamfleet.coordinator.service.leader_check import ASK_INTERVAL, LeaderCheck, rank
 
-PATIENCE = 5.0
+TIMEOUT = 5.0
 
 
 def note(nonce, incarnation=1, began=100.0, run_uid="r"):
@@ -14,7 +14,7 @@ def note(nonce, incarnation=1, began=100.0, run_uid="r"):
 
 
 def rivals(own):
-    return LeaderCheck(own.nonce, PATIENCE, own)
+    return LeaderCheck(own.nonce, TIMEOUT, own)
 
 
 def test_the_own_token_that_returns_after_a_network_cut_is_ignored():
@@ -28,7 +28,7 @@ def test_the_own_token_that_returns_after_a_network_cut_is_ignored():
 def test_a_lingering_token_of_a_killed_predecessor_ends_nothing():
     mine = rivals(note("b", incarnation=2))
     mine.appear("a", 0.0)
-    assert mine.find_stronger(PATIENCE - 0.1) is None
+    assert mine.find_stronger(TIMEOUT - 0.1) is None
     mine.vanish("a")
     mine.record_note(note("a", incarnation=9))  # its answer came after its token went
     assert mine.find_stronger(100.0) is None
@@ -40,9 +40,9 @@ def test_a_coordinator_counts_once_it_answers_or_once_its_lease_is_over():
     assert mine.due_to_ask(0.0) == ["a"]
     assert mine.due_to_ask(0.1) == []
     assert mine.due_to_ask(ASK_INTERVAL) == ["a"]
-    assert mine.find_stronger(PATIENCE + 0.1) == ("a", None)
+    assert mine.find_stronger(TIMEOUT + 0.1) == ("a", None)
     mine.record_note(note("a", began=200.0))
-    assert mine.find_stronger(PATIENCE + 0.1) is None, "it began later, and leaves"
+    assert mine.find_stronger(TIMEOUT + 0.1) is None, "it began later, and leaves"
     mine.record_note(note("a", began=50.0))
     assert mine.find_stronger(0.2) is not None
     assert mine.due_to_ask(9.0) == []

@@ -1,4 +1,4 @@
-"""One coordinator serves a run that was taken back in another life. Tests coordinator/service/main.py and
+"""One coordinator serves a run that was taken back in another incarnation. Tests coordinator/service/main.py and
 coordinator/verbs/bar.py."""
 
 from contextlib import nullcontext
@@ -34,7 +34,7 @@ def test_the_next_life_keeps_the_lock_and_the_revoked_seats(tmp_path, random_bun
     seats, revoked = [], {"worker.1"}
 
     def resolve(request, folder):
-        """Between two lives nobody else gets the run."""
+        """Between two incarnations nobody else gets the run."""
         if seats:
             with pytest.raises(UsageError):
                 bar_stored(folder, "b", is_barred=True)

@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dreamfleet.common.client.run_view import LiveRunView
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.records import StageSettings
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages
-from dreamfleet.coordinator.jobs.work import vector_bytes
+from dreamfleet.coordinator.jobs.scoring_job import vector_bytes
 from dreamfleet.coordinator.optimisers.evolution import Evolution
 from dreamfleet.coordinator.service.snapshot import take_snapshot
 from dreamfleet.coordinator.settings.fork import Fork
@@ -149,8 +150,8 @@ def test_the_status_says_which_stage_it_is_and_what_counts_there(staged):
     bench.end(lambda: found.append(take_snapshot(bench.run, "night", {}, 0.0, 0.0).status))
     seen = {(each.generation.stage.number, each.generation.stage.since) for each in found}
     assert seen == {(number, since) for number, since in enumerate(BEGUN, 1)}
-    stage = found[-1].generation.stage
-    assert (stage.total, stage.horizon, stage.patience, stage.population, stage.episodes) == (4, 600, 0, 8, 2)
+    settings = LiveRunView.of_status(found[-1]).stage_settings
+    assert (settings.task.horizon, settings.task.patience, settings.population, settings.episodes) == (600, 0, 8, 2)
 
 
 def test_a_kept_drive_is_driven_as_the_candidates_of_its_generation(staged):

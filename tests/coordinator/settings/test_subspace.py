@@ -78,11 +78,11 @@ def settings(random_bundle):
 
 
 def test_it_is_frozen_by_its_hash_and_a_later_stage_leaves_it(settings):
-    found, subspace = settings(stages=(StageSettings(generations=2), StageSettings(whole=True, sigma0=0.01)))
+    found, subspace = settings(stages=(StageSettings(generations=2), StageSettings(all_parameters=True, sigma0=0.01)))
     assert found.subspace == subspace.sha256
     assert RunSettings.from_json(found.to_json()) == found
     first, second = stages_of(found)
-    assert (first.whole, second.whole, second.starts_new_search) == (False, True, True)
+    assert (first.all_parameters, second.all_parameters, second.starts_new_search) == (False, True, True)
     searches = [Evolution.of(found, stage, subspace, None) for stage in (first, second)]
     assert [each.state().head.origin is None for each in searches] == [False, True]
 
@@ -90,11 +90,11 @@ def test_it_is_frozen_by_its_hash_and_a_later_stage_leaves_it(settings):
 @pytest.mark.parametrize(
     ("stages", "number"),
     [
-        ((StageSettings(whole=True),), 1),
-        ((StageSettings(generations=2), StageSettings(whole=True)), 2),
+        ((StageSettings(all_parameters=True),), 1),
+        ((StageSettings(generations=2), StageSettings(all_parameters=True)), 2),
         (
-            (StageSettings(generations=2), StageSettings(whole=True, sigma0=0.1, generations=2),
-             StageSettings(whole=True, sigma0=0.1)), 3,
+            (StageSettings(generations=2), StageSettings(all_parameters=True, sigma0=0.1, generations=2),
+             StageSettings(all_parameters=True, sigma0=0.1)), 3,
         ),
     ],
 )  # fmt: skip
@@ -106,7 +106,7 @@ def test_a_schedule_leaves_it_once(settings, stages, number):
 def test_nothing_to_leave_is_refused_and_a_subspace_of_another_world_model_or_of_other_eyes(
     random_bundle,
 ):
-    stages = (StageSettings(generations=2), StageSettings(whole=True, sigma0=0.1))
+    stages = (StageSettings(generations=2), StageSettings(all_parameters=True, sigma0=0.1))
     with pytest.raises(UsageError, match=r"2.*--subspace"):
         freeze(RunConfig(stages=stages), random_bundle)
     features = random_bundle.controller_shape.features

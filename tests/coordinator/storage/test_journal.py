@@ -19,7 +19,7 @@ from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.coordinator.jobs.confirmation import Finalist
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.generation import Generation
-from dreamfleet.coordinator.jobs.work import vector_bytes
+from dreamfleet.coordinator.jobs.scoring_job import vector_bytes
 from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.coordinator.storage.journal_file import sqlite_side_files
 from dreamfleet.coordinator.storage.recall_records import REWOUND

@@ -9,7 +9,7 @@ from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.seeds import CHOOSING_OFFSET, validation_seeds
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.generation import Generation
-from dreamfleet.coordinator.jobs.work import make_work
+from dreamfleet.coordinator.jobs.scoring_job import make_jobs
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.support.run_bench import SETTINGS
 from tests.support.samples import SPEC
@@ -112,7 +112,7 @@ def test_an_evaluation_of_which_a_barred_host_alone_confirmed_a_part_is_finished
 def test_who_only_confirmed_the_report_decided_about_no_candidate_and_no_evaluation(journal):
     journal.schedule_evaluation(Evaluation(0, VECTORS[0], 1))
     seeds = validation_seeds(2, CHOOSING_OFFSET)
-    scored, failed = (each.job for each in make_work(SPEC, "evaluate", 0, 0, VECTORS[0], seeds, first=CHOOSING_OFFSET))
+    scored, failed = (each.job for each in make_jobs(SPEC, "evaluate", 0, 0, VECTORS[0], seeds, first=CHOOSING_OFFSET))
     journal.results.add(scored, Result(scored.digest, 1.0, 10, 0.1, None, None), "c/1", "f", 1, "class")
     journal.verification.add(scored, "c/1", "d", "equal")
     journal.add_failure(failed, Failure("no score", ""), ["e/1"], 1)

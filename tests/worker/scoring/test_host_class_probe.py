@@ -7,7 +7,7 @@ from dreamfleet import ControllerShape, Scorer, TaskSpec
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_from_fingerprint
 from dreamfleet.worker.scoring.host_class_probe import HostClassProbe, fixed_parameters
-from dreamfleet.worker.tasks.policy import FlatPolicy
+from dreamfleet.worker.tasks.model_free_policies import FlatPolicy
 from dreamfleet.worker.worlds.car_racing import environment
 from tests.support import tasks
 from tests.support.environments import ODD

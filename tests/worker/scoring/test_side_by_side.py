@@ -77,14 +77,14 @@ def test_a_watched_or_measured_group_is_driven_one_by_one(tiny):
         (n, step) for n in range(4) for step in range(10)
     ]
     measuring = Scorer(spec(tiny, measures=("gas",)), tiny)
-    assert measuring.together == 1
+    assert measuring.side_by_side == 1
     assert all(score.measures for score in measuring.score_all(jobs(tiny)[:2], lambda _: None))
 
 
 def test_the_drives_of_a_dreams_run_are_driven_side_by_side(tiny):
     asked = TaskSpec("dream", tiny.sha256, horizon=60, patience=30, temperature=1.0)
     scorer, real, driven = Scorer(asked, tiny), Scorer(spec(tiny), tiny), asked.with_overrides(driven=True)
-    assert scorer.together == CarRacingTask.batch_size
+    assert scorer.side_by_side == CarRacingTask.batch_size
     together = scorer.score_all(jobs(tiny), lambda _: None, driven)
     assert together == [scorer.score(*each, spec=driven) for each in jobs(tiny)]
     assert together == real.score_all(jobs(tiny), lambda _: None)

@@ -15,7 +15,7 @@ from dreamfleet.common.transport.session import Network, open_session
 from dreamfleet.worker.service import bundle_fetch
 from dreamfleet.worker.service.bundle_fetch import MAX_ATTEMPTS, fetch_bundle
 from tests.support import tasks
-from tests.support.hand import DEADLINE, Hand, stranger
+from tests.support.hand import DEADLINE, Hand, unknown_sender
 from tests.support.processes import free_port
 
 
@@ -94,7 +94,7 @@ def test_a_bundle_that_is_always_damaged_is_an_error(download):
     assert download.asked().count(0) == MAX_ATTEMPTS
 
 
-def test_wrong_parts_of_a_stranger_do_not_prevent_the_download(download):
+def test_wrong_parts_of_an_unknown_sender_do_not_prevent_the_download(download):
     total = len(download.content)
 
     def lie(query):
@@ -103,7 +103,7 @@ def test_wrong_parts_of_a_stranger_do_not_prevent_the_download(download):
         head = {"run_uid": download.hand.run_uid, "incarnation": 1, "sha256": bytes.fromhex(download.sha256)}
         return encode(BundlePart(**head, offset=offset, total=total, data=data))
 
-    with stranger(download.hand, keys.bundle(download.hand.run, download.sha256), lie):
+    with unknown_sender(download.hand, keys.bundle(download.hand.run, download.sha256), lie):
         assert download.fetch() == download.content
 
 

@@ -22,7 +22,7 @@ from dreamfleet.worker.service.config import WorkerConfig
 from dreamfleet.worker.service.slot import Slot
 from dreamfleet.worker.service.worker import Worker
 from tests.support import samples, tasks
-from tests.support.hand import DEADLINE, SECOND, SLOW_BEATS, Hand, stranger
+from tests.support.hand import DEADLINE, SECOND, SLOW_BEATS, Hand, unknown_sender
 from tests.support.processes import free_port
 from tests.support.stage import drained, wait_for
 
@@ -95,7 +95,7 @@ def test_a_refusal_is_logged_once_for_each_reason_and_the_run_is_asked_again(sta
 def test_one_answer_of_several_is_enough_to_join(stage, cached):
     hand = stage.hand()
     refusal = replace(samples.JSON["hello-reply"], run="test", accepted=False, why="go away", remedy="far away")
-    with stranger(hand, "dreamfleet/**", lambda _: encode_json(refusal)):
+    with unknown_sender(hand, "dreamfleet/**", lambda _: encode_json(refusal)):
         stage.worker()
         assert hand.ready().slots == 1
 

@@ -8,7 +8,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from dreamfleet.worker.service.membership import (
     NEXT_RUN_AFTER,
-    NEXT_RUN_PATIENCE,
+    NEXT_RUN_TIMEOUT,
     SEARCH_INTERVAL,
     SILENT_BEATS,
     SINGLE_RUN_DELAYS,
@@ -20,13 +20,13 @@ from dreamfleet.worker.service.membership import (
 )
 
 BEAT = 1.0
-PATIENCE = SILENT_BEATS * BEAT
+TIMEOUT = SILENT_BEATS * BEAT
 TIMEOUT = 60.0  # of a coordinator out of sight
 IDLE = WorkerLoad(idle=True, awaits_verdict=False, uploading=False)
 
 
 def joined(visible=True, **terms):
-    """A member at time 0, in the first life of its coordinator."""
+    """A member at time 0, in the first incarnation of its coordinator."""
     made = Membership(LeaveConditions(**terms), now=0.0)
     made.join("first", BEAT, now=0.0)
     if visible:
@@ -97,8 +97,8 @@ def test_a_worker_of_any_run_goes_on_soon_but_not_at_once_with_results():
     member.remove_coordinator("first", 0.0)
     assert not member.find_end(NEXT_RUN_AFTER, busy=False)
     assert member.find_end(NEXT_RUN_AFTER + 0.1, busy=False)
-    assert not member.find_end(NEXT_RUN_PATIENCE, busy=True)
-    assert member.find_end(NEXT_RUN_PATIENCE + 0.1, busy=True)
+    assert not member.find_end(NEXT_RUN_TIMEOUT, busy=True)
+    assert member.find_end(NEXT_RUN_TIMEOUT + 0.1, busy=True)
     assert not member.gives_up(math.inf), "that is no failure"
 
 
@@ -175,8 +175,8 @@ class AnyOrder(RuleBasedStateMachine):
     @rule(hands=hands, answers=st.booleans(), pause=st.floats(0.1, 2.0))
     def it_asks_if_it_must(self, hands, answers, pause):
         must = self.member.must_rejoin(self.now, hands)
-        patience = PATIENCE + (UPLOAD_GRACE if hands.uploading else 0)
-        forgotten = self.now - self.spoke > patience and (hands.idle or hands.awaits_verdict)
+        timeout = TIMEOUT + (UPLOAD_GRACE if hands.uploading else 0)
+        forgotten = self.now - self.spoke > timeout and (hands.idle or hands.awaits_verdict)
         reason = self.doubt or self.of not in self.seen or forgotten
         assert must == (bool(self.seen) and self.now >= self.allowed and reason)
         if not must:
@@ -204,7 +204,7 @@ class AnyOrder(RuleBasedStateMachine):
         self.now = max(self.now, self.allowed)
         self.it_asks_if_it_must(IDLE, answers=True, pause=1.0)
         self.the_coordinator_speaks()
-        self.now += PATIENCE / 2
+        self.now += TIMEOUT / 2
         assert not self.member.must_rejoin(self.now, IDLE)
 
     @invariant()

@@ -9,7 +9,7 @@ from dreamfleet.common.errors import RefusedError
 from dreamfleet.common.protocol.codec import encode_json
 from dreamfleet.common.protocol.messages import Heartbeat, ResultBatch
 from tests.support import samples, tasks
-from tests.support.hand import DEADLINE, SECOND, SLOW_BEATS, stranger, tag
+from tests.support.hand import DEADLINE, SECOND, SLOW_BEATS, tag, unknown_sender
 from tests.support.relay import Relay
 from tests.support.stage import wait_for
 
@@ -143,12 +143,12 @@ def test_another_run_of_the_same_name_is_joined_anew_or_ends_a_worker_with_exit_
         assert not served.done()
 
 
-def test_a_stranger_that_answers_as_another_run_does_not_end_its_membership(stage, relay, cached):
+def test_an_unknown_sender_that_answers_as_another_run_does_not_end_its_membership(stage, relay, cached):
     hand = stage.hand()
     stage.worker(relay.endpoint)
     hand.ready()
     other = replace(samples.JSON["hello-reply"], run="test", run_uid="f" * 32, accepted=True)
-    with stranger(hand, "dreamfleet/hello/test", lambda _: encode_json(other)):
+    with unknown_sender(hand, "dreamfleet/hello/test", lambda _: encode_json(other)):
         relay.cut()
         hand.hello()
         hand.send(1, hand.job())

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from dreamfleet import DreamfleetError, TaskSpec
 from dreamfleet.worker.scoring.failure_cause import crash
 from dreamfleet.worker.service.child import ScorerArguments
-from dreamfleet.worker.service.job_group import MOST_TRIED_ALONE
+from dreamfleet.worker.service.job_group import MOST_TRIED_SINGLY
 from dreamfleet.worker.service.slot_budget import SharedSlots
 from dreamfleet.worker.service.slot_pool import SlotPool
 from tests.support import rough_tasks, tasks
@@ -113,8 +113,8 @@ def test_a_failed_job_that_is_not_wanted_is_not_repeated(harness):
 def test_the_failures_of_a_fresh_childs_first_large_group_are_reported_at_once(harness):
     slot = harness(tasks.EXPLODING).wait_ready()
     pid = slot.slot.pid
-    slot.submit_group(range(MOST_TRIED_ALONE + 1))
-    assert [each.fitness for each in slot.results()] == [None] * (MOST_TRIED_ALONE + 1)
+    slot.submit_group(range(MOST_TRIED_SINGLY + 1))
+    assert [each.fitness for each in slot.results()] == [None] * (MOST_TRIED_SINGLY + 1)
     assert slot.slot.pid == pid
 
 
@@ -139,7 +139,7 @@ def test_a_job_that_crashes_its_process_takes_no_other_with_it(harness):
 def test_a_group_that_is_sent_again_without_its_unwanted_jobs_can_still_be_abandoned(harness):
     slot = harness(tasks.SLOW_TOY)
     assert slot.score(99).fitness is not None
-    jobs = slot.submit_group(range(MOST_TRIED_ALONE + 4))
+    jobs = slot.submit_group(range(MOST_TRIED_SINGLY + 4))
     slot.slot.abandon(jobs[0].digest)
     os.kill(slot.slot.pid, signal.SIGKILL)
     while slot.slot.ready:

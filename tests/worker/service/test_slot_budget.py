@@ -5,7 +5,7 @@ import random
 
 import pytest
 
-from dreamfleet.worker.service.slot_budget import PATIENCE, QUANTUM, RECENT, SlotBudget
+from dreamfleet.worker.service.slot_budget import QUANTUM, RECENT, TIMEOUT, SlotBudget
 
 
 class Simulated:
@@ -158,7 +158,7 @@ def test_a_run_that_does_not_take_its_turn_is_passed_over():
     budget = two_runs_of_one_slot()
     budget.settle(0, 0, 1, 5.0, has_jobs=True)
     assert not budget.take(0, 5.0)
-    assert budget.take(0, 5.0 + 1.1 * PATIENCE)
+    assert budget.take(0, 5.0 + 1.1 * TIMEOUT)
     budget.settle(0, 0, 1, 9.0, has_jobs=True)
     assert budget.take(0, 9.0), "no slot waits for it again"
     budget.settle(1, 0, 1, 9.5, has_jobs=True)

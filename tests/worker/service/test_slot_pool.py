@@ -67,7 +67,7 @@ def pool(random_bundle):
 
 def test_groups_of_episodes_that_are_driven_side_by_side_shrink_as_the_jobs_run_out(pool, random_bundle):
     fleet = pool(SIDE_BY_SIDE)
-    assert (fleet.slots.together, fleet.slots.capacity) == (4, 8)
+    assert (fleet.slots.side_by_side, fleet.slots.capacity) == (4, 8)
     jobs, results, sizes = fleet.score(11)
     assert sizes[:2] == [4, 4]
     assert sorted(sizes[2:], reverse=True) in ([2, 1], [1, 1, 1])
@@ -86,13 +86,13 @@ def test_a_slot_finds_from_its_drives_how_many_it_should_do_side_by_side(pool, m
     sizes = fleet.score(60)[2]
     assert set(sizes[: 4 * ENOUGH]) == {4, 2, 1}
     assert sizes[-8:-1] == [2] * 7
-    assert (fleet.slots.together, fleet.slots.capacity) == (2, 2)
+    assert (fleet.slots.side_by_side, fleet.slots.capacity) == (2, 2)
 
 
 @pytest.mark.parametrize("task", [f"{rough_tasks.MODULE}:OnlyOne", f"{tasks.MODULE}:OneByOne"])
 def test_without_a_second_environment_or_such_a_policy_jobs_are_scored_one_by_one(pool, task):
     fleet = pool(task)
-    assert (fleet.slots.together, fleet.slots.capacity) == (1, 2)
+    assert (fleet.slots.side_by_side, fleet.slots.capacity) == (1, 2)
     assert fleet.score(5)[2] == [1] * 5
 
 

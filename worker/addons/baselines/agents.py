@@ -25,7 +25,7 @@ from dreamfleet.worker.addons.evaluation.agents import Agent, EvolvedAgent
 from dreamfleet.worker.addons.evaluation.named_agents import DISCRETE, RANDOM
 from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT
 from dreamfleet.worker.tasks.drivers import UniformActions
-from dreamfleet.worker.tasks.policy import NO_PARAMETERS
+from dreamfleet.worker.tasks.model_free_policies import NO_PARAMETERS
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worlds.car_racing.agents import NetworkAgent, PictureAgent
 from dreamfleet.worker.worlds.car_racing.preprocessing import RAW

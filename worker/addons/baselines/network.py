@@ -14,7 +14,7 @@ from torch.nn import functional
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.worker.addons.baselines.presets import AgentConfig, LearningConfig
 from dreamfleet.worker.addons.baselines.replay_buffer import TraceBatch
-from dreamfleet.worker.tasks.policy import FrameSkipPolicy
+from dreamfleet.worker.tasks.model_free_policies import FrameSkipPolicy
 
 Memory = tuple[Tensor, Tensor]
 """Hidden and cell state `(1, N, hidden)`."""

@@ -30,7 +30,7 @@ from dreamfleet.worker.addons.baselines.progress import (
 )
 from dreamfleet.worker.addons.baselines.replay_buffer import Episode, ReplayBuffer, first_in_replay
 from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition, run_episode
-from dreamfleet.worker.tasks.policy import NO_PARAMETERS
+from dreamfleet.worker.tasks.model_free_policies import NO_PARAMETERS
 from dreamfleet.worker.training.checkpoint import load_checkpoint, save_checkpoint
 from dreamfleet.worker.training.data.data_folder import explain_write_errors
 from dreamfleet.worker.training.data.dataset import find_world, preprocessing_of_size

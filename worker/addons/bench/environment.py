@@ -18,7 +18,7 @@ from dreamfleet.common.artifacts.bundle_store import find_bundle, pretrained_fol
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.common.runs.seeds import VALIDATION
-from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode, score_together
+from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode, score_side_by_side
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.worldmodel.policy import ModelPolicy
 from dreamfleet.worker.worlds.car_racing.native_check import (
@@ -50,7 +50,7 @@ def bench_env(bundle: Bundle, rounds: int) -> dict[str, Any]:
         recorded_drives = [record_drive(first_seed + number) for number in range(together)]
         for name, measure in cases.items():
             times[name].append(measure(recorded_drives[0]))
-        times["fitness_step"].append(seconds_a_step_together(bundle, recorded_drives))
+        times["fitness_step"].append(seconds_a_step_side_by_side(bundle, recorded_drives))
     seconds = {name: statistics.median(values) for name, values in times.items()}
 
     def ratio(slow: str, fast: str) -> float | None:
@@ -152,7 +152,7 @@ def seconds_a_step(
     return seconds
 
 
-def seconds_a_step_together(bundle: Bundle, recorded_drives: Sequence[RecordedDrive]) -> float:
+def seconds_a_step_side_by_side(bundle: Bundle, recorded_drives: Sequence[RecordedDrive]) -> float:
     """Seconds per step of episodes that are driven side by side, resets included, under a policy of random parameters.
 
     As in `seconds_a_step`, its time counts, and its actions are not used.
@@ -161,7 +161,7 @@ def seconds_a_step_together(bundle: Bundle, recorded_drives: Sequence[RecordedDr
     environments = [Repetition(task.make_environment(assignment), each) for each in recorded_drives]
     policies, parameters = make_random_policy(bundle).side_by_side(), random_parameters(bundle)
     started = perf_counter()
-    scores = score_together(
+    scores = score_side_by_side(
         environments, policies, [parameters] * len(environments),
         [EpisodeConfig(each.seed, STEPS) for each in recorded_drives],
     )  # fmt: skip

@@ -36,7 +36,7 @@ from dreamfleet.worker.dream.world import check_temperature
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 FOLDS = 10  # many, because linear probes are fast to fit and steps off the road are rare
-PATIENCE = 10  # most drives per wanted loss
+MAX_DRIVES = 10  # most drives per wanted loss
 CALM = "no loss"  # name of the beginnings after which reality stays on the road
 BEGUN = {"0 steps before": "at the loss", CALM: "where nothing is lost"}  # clearer words for some beginnings
 WHERE = {
@@ -150,7 +150,7 @@ def collect_losing_drives(
 ) -> list[DisturbedDrive]:  # fmt: skip
     """Collect drives until `config.losses` have lost the road; `UsageError` if ten times as many drives have not."""
     taken, losses = list[DisturbedDrive](), 0
-    for drive in islice(drives, PATIENCE * config.losses):
+    for drive in islice(drives, MAX_DRIVES * config.losses):
         if lacking := {OFF, OFFSET} - drive.truth.keys():
             raise UsageError(
                 f"the world's true state lacks {' and '.join(sorted(lacking))}: losses of the road cannot be seen"

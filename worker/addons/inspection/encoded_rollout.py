@@ -20,7 +20,7 @@ from dreamfleet.worker.scoring.disturbance import numbered_choices
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.api import Assignment, Continuous, Policy, World
 from dreamfleet.worker.tasks.closing import closing_environment
-from dreamfleet.worker.tasks.policy import DriverPolicy
+from dreamfleet.worker.tasks.model_free_policies import DriverPolicy
 from dreamfleet.worker.tasks.recordable import RecordableTask
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.worldmodel.inference import Encoder

@@ -19,7 +19,7 @@ from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.worker.scoring.actors import Actor, ControllerActor, Floats
 from dreamfleet.worker.tasks.api import Policy
-from dreamfleet.worker.tasks.policy import ALL_DRIVERS, NO_PARAMETERS, DriverPolicy
+from dreamfleet.worker.tasks.model_free_policies import ALL_DRIVERS, NO_PARAMETERS, DriverPolicy
 from dreamfleet.worker.tasks.recordable import RecordableTask, TaskWithPolicies
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState

@@ -27,7 +27,7 @@ from dreamfleet.worker.scoring.disturbance import numbered_choices
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.api import Assignment, Driver, Task, World
 from dreamfleet.worker.tasks.closing import closing_environment
-from dreamfleet.worker.tasks.policy import NO_PARAMETERS, DriverPolicy
+from dreamfleet.worker.tasks.model_free_policies import NO_PARAMETERS, DriverPolicy
 from dreamfleet.worker.tasks.registry import task_of
 
 Lengths = NDArray[np.int64]
@@ -209,10 +209,10 @@ def _dream_lengths(
 ) -> Lengths:
     """The lengths `(seeds,)` of dreams under a driver, or under the controller."""
     parts = [seeds[start : start + MAX_ROWS] for start in range(0, len(seeds), MAX_ROWS)]
-    return np.concatenate([_dream_together(world, make, controller, part, limit) for part in parts])
+    return np.concatenate([_dream_side_by_side(world, make, controller, part, limit) for part in parts])
 
 
-def _dream_together(
+def _dream_side_by_side(
     world: DreamWorld, make: DriverMaker | None, controller: Controller | None, seeds: Sequence[int], limit: int
 ) -> Lengths:
     drivers = [] if make is None else [make(np.random.default_rng(seed)) for seed in seeds]

@@ -27,7 +27,7 @@ from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, Rollout
 from dreamfleet.worker.scoring.scorer import DRIVER_NAME
 from dreamfleet.worker.tasks.api import Policy
 from dreamfleet.worker.tasks.closing import close_environment, closing_environment
-from dreamfleet.worker.tasks.policy import ALL_DRIVERS, DriverPolicy
+from dreamfleet.worker.tasks.model_free_policies import ALL_DRIVERS, DriverPolicy
 from dreamfleet.worker.tasks.recordable import RecordableTask, TaskWithBeginnings
 from dreamfleet.worker.training.data import dataset
 from dreamfleet.worker.training.data.collect_config import CollectConfig, source_policies

@@ -16,7 +16,7 @@ from dreamfleet.common.protocol.messages import Share
 from dreamfleet.common.schema.validation import Count
 from dreamfleet.worker.scoring.rollout import DataWorld
 from dreamfleet.worker.tasks.api import Policy
-from dreamfleet.worker.tasks.policy import ALL_DRIVERS
+from dreamfleet.worker.tasks.model_free_policies import ALL_DRIVERS
 from dreamfleet.worker.tasks.recordable import RecordableTask, TaskWithBeginnings, TaskWithPolicies
 from dreamfleet.worker.training.data.dataset import find_world, preprocessing_of_size
 

@@ -18,7 +18,7 @@ from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Mirror
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.car_racing_variants import FACTS
 from dreamfleet.worker.tasks.api import Assignment, DreamReward, Driver, Policy, Task, World
-from dreamfleet.worker.tasks.policy import DriverPolicy
+from dreamfleet.worker.tasks.model_free_policies import DriverPolicy
 from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.tasks.registry import preprocessing_for
 from dreamfleet.worker.worldmodel.policy import ModelPolicy

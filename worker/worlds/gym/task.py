@@ -24,7 +24,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.worker.tasks.api import Assignment, Description, Policy, Task, World
 from dreamfleet.worker.tasks.closing import close_environment, closing_environment
-from dreamfleet.worker.tasks.policy import FlatPolicy
+from dreamfleet.worker.tasks.model_free_policies import FlatPolicy
 from dreamfleet.worker.tasks.reset import reset_folded
 from dreamfleet.worker.worlds.gym import environments
 from dreamfleet.worker.worlds.gym.pixels import GymPixelTask, PixelOptions

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.actions import Continuous, Mirror, one_hot
 from dreamfleet.worker.tasks.api import Assignment, Description, DreamReward, Driver, Policy, Task, World
 from dreamfleet.worker.tasks.drivers import HeldActions, UniformActions
+from dreamfleet.worker.tasks.model_free_policies import DriverPolicy, FlatPolicy
 from dreamfleet.worker.tasks.pictures import CropAndResize, VectorActions
-from dreamfleet.worker.tasks.policy import DriverPolicy, FlatPolicy
 from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.tasks.registry import preprocessing_for
 from dreamfleet.worker.worldmodel.policy import ModelPolicy

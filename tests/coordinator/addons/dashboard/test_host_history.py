@@ -2,14 +2,14 @@
 
 import pytest
 
-from dreamfleet.common.runs.records import StoredEvent, StoredWork
+from dreamfleet.common.runs.records import StoredEvent, WorkerEffort
 from dreamfleet.coordinator.addons.dashboard.host_history import BINS, MOST_HOSTS, host_history
 
 TIMES = {0: (1000.0, 1060.0), 1: (1060.0, 1120.0)}
 
 
 def work(worker="desk/0a", generation=0, kind="score", confirming=False, steps=600.0, seconds=30.0):
-    return StoredWork(worker, generation, kind, confirming, 6, steps, seconds)
+    return WorkerEffort(worker, generation, kind, confirming, 6, steps, seconds)
 
 
 def event(at, what="", worker="", incarnation=1):

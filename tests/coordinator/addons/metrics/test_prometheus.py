@@ -110,7 +110,7 @@ def test_several_runs_share_each_metrics_head():
 
 
 def test_a_client_that_sends_a_byte_at_a_time_delays_neither_others_nor_the_end(monkeypatch):
-    monkeypatch.setattr(metrics_server, "PATIENCE", 0.5)
+    monkeypatch.setattr(metrics_server, "TIMEOUT", 0.5)
     port, over = free_port(), threading.Event()
 
     def drip():

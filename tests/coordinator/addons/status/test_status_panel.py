@@ -12,6 +12,7 @@ from rich.console import Console
 
 from dreamfleet.common.client.equal_fitness import ENOUGH
 from dreamfleet.common.client.status import FailureStatus, Population, StageStatus
+from dreamfleet.common.runs.records import StageSettings
 from dreamfleet.coordinator.addons.status.status_panel import Block, RunPanel, allocate_lines, panel_lines
 from dreamfleet.coordinator.addons.status.terminal_charts import bar_chart, candidate_grid
 from dreamfleet.coordinator.addons.status.worker_table import WorkerTable, find_slowest
@@ -211,18 +212,18 @@ def test_the_curve_covers_the_whole_run(columns):
 
 
 def test_a_driven_stage_is_described_and_its_curve_dims_earlier_ones():
-    settings = replace(STATUS.settings, task=replace(STATUS.settings.task, task="dream"))
     history = tuple(replace(STATUS.last, number=number) for number in range(7))
-    stage = StageStatus(2, 2, 5, 1000, 100, 24, 4, racing=False, driven=1.0)
+    generation = replace(STATUS.generation, temperature=1.5, stage=StageStatus(2, 5))
 
-    def shown(stage):
-        generation = replace(STATUS.generation, temperature=1.5, stage=stage)
+    def shown(driven):
+        stages = StageSettings(generations=5), StageSettings(horizon=1000, driven=driven)
+        settings = replace(STATUS.settings, task=replace(STATUS.settings.task, task="dream"), stages=stages)
         return drawn(100, settings=settings, recent=history, generation=generation)
 
-    text = shown(stage)
+    text = shown(1.0)
     assert re.search("dream, .*1,000", text)
     assert re.search(r"(?s)\b0 .*6.* 2 .*5", text)
-    assert re.search(r"(?s)dream, .*1,000.* 50%.* 1\.5", shown(replace(stage, driven=0.5)))
+    assert re.search(r"(?s)dream, .*1,000.* 50%.* 1\.5", shown(0.5))
 
 
 def test_generations_of_one_fitness_have_a_line():

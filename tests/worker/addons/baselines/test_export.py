@@ -28,7 +28,7 @@ from dreamfleet.worker.addons.evaluation.agents import make_agent
 from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
 from dreamfleet.worker.addons.evaluation.named_agents import find_driver
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
-from dreamfleet.worker.tasks.policy import NO_PARAMETERS
+from dreamfleet.worker.tasks.model_free_policies import NO_PARAMETERS
 from dreamfleet.worker.training.checkpoint import save_checkpoint
 from dreamfleet.worker.worldmodel.inference import open_graph
 from dreamfleet.worker.worldmodel.vae import VAE

@@ -1,5 +1,5 @@
 """Uniform random actions are judged in any environment by the path that judges a controller of that task.
-Tests agents.py, worker/tasks/policy.py and worker/addons/evaluation/named_agents.py."""
+Tests agents.py, worker/tasks/model_free_policies.py and worker/addons/evaluation/named_agents.py."""
 
 import json
 import re

@@ -15,7 +15,7 @@ from dreamfleet.worker.addons.baselines import verb as baseline
 from dreamfleet.worker.addons.baselines.network import Networks, QPolicy
 from dreamfleet.worker.addons.baselines.presets import LEARNING, NOTEBOOK, AgentConfig, LearningConfig
 from dreamfleet.worker.addons.baselines.train import CHECKPOINT, CURVE, episode_file, train_drqn
-from dreamfleet.worker.tasks.policy import NO_PARAMETERS
+from dreamfleet.worker.tasks.model_free_policies import NO_PARAMETERS
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights, save_checkpoint
 from tests.support.disks import file_size_limit
 from tests.support.verbs import run_verb

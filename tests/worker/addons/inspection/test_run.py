@@ -10,7 +10,7 @@ from dreamfleet.common.runs.lookup import find_controller
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
-from dreamfleet.coordinator.jobs.work import vector_bytes
+from dreamfleet.coordinator.jobs.scoring_job import vector_bytes
 from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.worker.addons.inspection import measurements, verb
 from dreamfleet.worker.addons.inspection.dream_comparisons import LossReport, RoadLossComparison

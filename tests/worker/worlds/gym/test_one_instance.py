@@ -31,7 +31,7 @@ def name_of(kind):
 def test_a_slot_scores_and_is_watched(kind):
     scorer = Scorer(TaskSpec(name_of(kind), "", 1000, 0, SHAPE))
     assert scorer.host_class
-    assert scorer.together == 1
+    assert scorer.side_by_side == 1
     parameters = np.array([0.5, -0.5, 0.1], np.float32)
     plain = scorer.score("score", parameters, 7)
     scorer.observer = Watching()

@@ -8,7 +8,7 @@ import pytest
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
-from dreamfleet.worker.tasks.policy import DriverPolicy
+from dreamfleet.worker.tasks.model_free_policies import DriverPolicy
 from dreamfleet.worker.tasks.registry import find_task
 from tests.support import pixel_fakes
 from tests.support.pixel_world import DODGE

@@ -1,4 +1,7 @@
-"""A schedule as people write it: what it may say, and what is wrong with it in one line. Tests run_setup.py."""
+"""A schedule as people write it: what it may say, and what is wrong with it in one line.
+
+Tests run_setup.py and stage_tables.py.
+"""
 
 import argparse
 
@@ -12,7 +15,7 @@ from dreamfleet.common.runs.stages import stages_of
 from dreamfleet.coordinator.settings.config import RunConfig, config_values
 from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.run_setup import _with_stages, load_run_config
-from dreamfleet.coordinator.settings.schedule import find_schedule, remaining_settings
+from dreamfleet.coordinator.settings.stage_tables import find_schedule, remaining_settings
 from tests.support.frozen_settings import comes_back
 
 WHOLE = """

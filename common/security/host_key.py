@@ -13,10 +13,10 @@ from dreamfleet.common.artifacts.bundle_store import default_cache
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.files.regular_files import open_regular
 
-NAME, BYTES = "anchor.key", 32
+NAME, BYTES = "host.key", 32
 
 
-def make_anchor_key() -> bytes:
+def make_host_key() -> bytes:
     """This user's key on this host, made if there is none; empty if the cache folder cannot hold it."""
     with suppress(OSError, DreamfleetError):
         path = _path()
@@ -29,20 +29,20 @@ def make_anchor_key() -> bytes:
     return _read()
 
 
-def anchor_proof(worker: str) -> str:
-    """What shows that `worker`, a name with its life, runs on this host as this user; empty if there is no key."""
-    return proof_for(_read(), worker)
+def host_token(worker: str) -> str:
+    """What shows that `worker`, `name/process`, runs on this host as this user; empty if there is no key."""
+    return token_for(_read(), worker)
 
 
-def proof_for(key: bytes, worker: str) -> str:
-    """The proof that a worker sends, 64 hexadecimal digits; empty without a key."""
+def token_for(key: bytes, worker: str) -> str:
+    """The token that a worker sends, 64 hexadecimal digits; empty without a key."""
     return hmac.digest(key, worker.encode(), "sha256").hex() if len(key) == BYTES else ""
 
 
-def is_proof(key: bytes, worker: str, proof: str) -> bool:
-    """Whether a proof is that of this key and worker."""
-    expected = proof_for(key, worker)
-    return bool(expected) and hmac.compare_digest(expected.encode(), proof.encode())
+def is_token_of(key: bytes, worker: str, token: str) -> bool:
+    """Whether a token is that of this key and worker."""
+    expected = token_for(key, worker)
+    return bool(expected) and hmac.compare_digest(expected.encode(), token.encode())
 
 
 def _path() -> Path:

@@ -52,8 +52,8 @@ def split_first_stage(stages: tuple[StageSettings, ...]) -> tuple[dict[str, Any]
     first = stages[0]
     if first.restart:
         raise UsageError("stage 1: restart is for a later stage, which searches anew where the run began; omit it")
-    if first.whole:
-        raise UsageError("stage 1: whole is for a later stage, which leaves the subspace; omit --subspace instead")
+    if first.all_parameters:
+        raise UsageError("stage 1: all_parameters is for a later stage, to leave the subspace; omit --subspace instead")
     return first.overrides, (first.end, *stages[1:]) if first.has_end or len(stages) > 1 else ()
 
 
@@ -72,15 +72,15 @@ def check_schedule(settings: RunSettings) -> None:
                 f"stage {stage.number} is a restart, which is left out once a score is reached: give stage "
                 f"{before.number} a score, and steps or generations"
             )
-        if each.restart and (each.whole or each.overrides):
-            named = ", ".join([*each.overrides, *["whole"] * each.whole])
+        if each.restart and (each.all_parameters or each.overrides):
+            named = ", ".join([*each.overrides, *["all_parameters"] * each.all_parameters])
             raise UsageError(
                 f"stage {stage.number} is a restart, which searches as stage {before.number} does and may be left out: "
                 f"omit {named}"
             )
-        if each.whole and before.whole:
-            raise UsageError(f"stage {stage.number}: the search is whole already; omit that, or give --subspace")
-        if each.whole and each.sigma0 is None:
+        if each.all_parameters and before.all_parameters:
+            raise UsageError(f"stage {stage.number}: it searches all parameters already; omit that, or give --subspace")
+        if each.all_parameters and each.sigma0 is None:
             raise UsageError(
                 f"stage {stage.number} leaves the subspace, where a step is something else: give it a sigma0"
             )
