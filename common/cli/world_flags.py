@@ -22,9 +22,10 @@ def add_world_flags(parser: argparse.ArgumentParser) -> None:
         f"--{ENVIRONMENT}", nargs="+", metavar="KEY=VALUE", help="arguments of the world; values as in JSON"
     )
     group.add_argument(
-        "--observation", metavar="KEY",
+        "--observation",
+        metavar="KEY",
         help="picture among several, by its key; render: what is drawn; all: every frame of a stack",
-    )  # fmt: skip
+    )
     group.add_argument("--crop", metavar="TOP:BOTTOM,LEFT:RIGHT", help="part of the picture that is seen, in pixels")
     group.add_argument("--size", type=int, metavar="N", help="height and width of the picture: 64 or 96 (default 64)")
     group.add_argument("--skip", type=int, metavar="N", help="steps of the world for which an action is held")

@@ -166,8 +166,7 @@ class LiveRunView(RunView):
     def progress(self) -> str:
         """The open generation and its episodes."""
         now = self.status.generation
-        done = format_episodes(EpisodeProgress(now.episodes_done, now.episodes))
-        return f"generation {now.number}: {done if now.episodes else 'all candidates failed'}"
+        return f"generation {now.number}: {format_episodes(now) if now.episodes else 'all candidates failed'}"
 
     @property
     def _judging(self) -> str:

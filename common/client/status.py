@@ -55,12 +55,10 @@ class StageStatus:
 
 
 @dataclass(frozen=True)
-class GenerationStatus:
-    """The generation that is being scored."""
+class GenerationStatus(EpisodeProgress):
+    """The generation that is being scored; with racing, half of its episodes are decided later."""
 
     number: Count
-    episodes_done: Count
-    episodes: Count  # known so far: with racing, half of them are decided later
     seconds: Seconds  # in which it could be scored: not paused, and with a worker
     sigma: float  # the optimiser's step size
     temperature: float | None  # of the dream; `None` if the task has none

@@ -139,9 +139,10 @@ class FunctionChild(Child):
             ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", send_limit, 0))
         parent = os.getpid() if ends_with_parent else 0
         process = context.Process(
-            target=_call_in_child, args=(parent, function, theirs, arguments),
+            target=_call_in_child,
+            args=(parent, function, theirs, arguments),
             daemon=is_own,  # a simulator may start processes with `multiprocessing`, which daemons may not
-        )  # fmt: skip
+        )
 
         def begin() -> BaseProcess:
             process.start()

@@ -71,8 +71,7 @@ def access_control_config(passwords: bool, revoked_seats: Collection[str] = ()) 
 
 
 def _rule(name: str, flows: tuple[str, ...], messages: tuple[str, ...], on: tuple[str, ...]) -> dict[str, Any]:
-    return {"id": name, "permission": "allow", "flows": list(flows), "messages": list(messages),
-            "key_exprs": list(on)}  # fmt: skip
+    return {"id": name, "permission": "allow", "flows": list(flows), "messages": list(messages), "key_exprs": list(on)}
 
 
 def _seat_rules(who: str, seat: int) -> list[dict[str, Any]]:

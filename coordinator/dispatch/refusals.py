@@ -47,8 +47,9 @@ def find_refusal(
             remedy += "; or, if you trust it, start the worker with it"
         return Refusal(
             f"this run scores in {task!r}, which the worker does not know (it knows: {_describe_tasks(request.tasks)})",
-            remedy, task if is_unregistered(task) else "",
-        )  # fmt: skip
+            remedy,
+            task if is_unregistered(task) else "",
+        )
     if request.packages != packages:
         named, own = (truncate(", ".join(each), LONGEST) for each in (request.packages, packages))
         return Refusal(f"its fingerprint names {named}, this run's {own}", "start the worker again")

@@ -66,9 +66,7 @@ class Decision:
     by_trusted: bool = False  # whether the word of a trusted host alone says who is wrong
 
 
-def decide(
-    answers: Sequence[Answer], present: Collection[str], others: bool, trusted: Collection[str]
-) -> Decision:  # fmt: skip
+def decide(answers: Sequence[Answer], present: Collection[str], others: bool, trusted: Collection[str]) -> Decision:
     """What the answers of hosts of one class to one job prove.
 
     `present` are the hosts that could answer again, `others` says whether one is here that has not answered, and

@@ -196,8 +196,9 @@ def fail_if_excessive(result: Result, horizon: int, measures: int) -> Result:
     if why is None and len(result.measures) != measures:
         why = Failure(
             f"wrong measures: the episode gave {plural(len(result.measures), 'number')} beside its fitness, "
-            f"not {measures}", "wrong measures",
-        )  # fmt: skip
+            f"not {measures}",
+            "wrong measures",
+        )
     return result if why is None else replace(result, fitness=None, steps=steps, error=why, upload=None, measures=())
 
 

@@ -33,8 +33,8 @@ class BatchQueries:
         key = str(query.key_expr)
         verb = key.rsplit("/", 1)[-1]
         payload = query.payload.to_bytes() if query.payload is not None else b""
-        reply = self._batches.answer(verb if key == keys.batch(self._name, verb) else key, query.parameters.get,
-                                     payload, now)  # fmt: skip
+        named = verb if key == keys.batch(self._name, verb) else key
+        reply = self._batches.answer(named, query.parameters.get, payload, now)
         if self._batches.run.state.stalled:
             _reply(query, reply)
         else:

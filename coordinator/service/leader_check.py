@@ -60,9 +60,10 @@ class LeaderCheck:
     def live(self, now: float) -> list[tuple[str, ClaimNote | None]]:
         """The live coordinators: each one's nonce and note, `None` if it does not answer."""
         return [
-            (nonce, each.note) for nonce, each in self._seen.items()
+            (nonce, each.note)
+            for nonce, each in self._seen.items()
             if each.note is not None or now - each.since > self.timeout
-        ]  # fmt: skip
+        ]
 
     def find_stronger(self, now: float) -> tuple[str, ClaimNote | None] | None:
         """A coordinator before which this one must leave; `None` if there is none.

@@ -18,7 +18,7 @@ from dreamfleet.common.transport.session import LEASE_MS, enqueue_into
 from dreamfleet.coordinator.service.leader_check import LeaderCheck
 
 DISCOVERY_SECONDS = 0.3  # seconds until all present tokens are visible
-TIMEOUT = LEASE_MS / 1000 + 1  # seconds: the token of a dead coordinator vanishes earlier
+TOKEN_TIMEOUT = LEASE_MS / 1000 + 1  # seconds: the token of a dead coordinator vanishes earlier
 TIMEOUT = 2.0  # seconds of a query
 
 
@@ -29,7 +29,7 @@ class NameLock:
         self._session = session
         self._run = run
         self._nonce = nonce
-        self._leader_check = LeaderCheck(nonce, TIMEOUT)
+        self._leader_check = LeaderCheck(nonce, TOKEN_TIMEOUT)
         self._inbox: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._stack = stack
         watcher = session.liveliness().declare_subscriber(

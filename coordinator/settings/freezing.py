@@ -105,7 +105,7 @@ def _with_bundle(config: RunConfig, bundle: Bundle) -> Scored:
     driving, facts = _driving(config, bundle), bundle.manifest.facts
     shape = bundle.with_controllers(
         bundle.shape_of(config.features, _hidden(config), driving), driving
-    ).controller_shape  # fmt: skip
+    ).controller_shape
     own_shape = None if shape == bundle.default_shape else shape
     end = config.end and EndRule.parse(config.end).text
     end = "" if end == facts.end.text else end  # so that it scores as a run that names none

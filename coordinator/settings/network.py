@@ -52,9 +52,10 @@ class NetworkConfig:
         flag=False,
     )
     insecure: bool = option(
-        False, "listen beyond this host without a join file: anyone who reaches the port owns the run, may read, forge "
-        "and stop everything"
-    )  # fmt: skip
+        False,
+        "listen beyond this host without a join file: anyone who reaches the port owns the run, may read, forge "
+        "and stop everything",
+    )
 
     def __post_init__(self) -> None:
         if self.metrics_port:

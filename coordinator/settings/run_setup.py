@@ -35,10 +35,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "which flags may change; RUN is only read",
     )  # fmt: skip
     how.add_argument(
-        "--init", metavar="CONTROLLER",
+        "--init",
+        metavar="CONTROLLER",
         help="begin a new run with this controller's parameters instead of zeros, and take over nothing else: a file, "
         "a run, or one that ships",
-    )  # fmt: skip
+    )
     add_json_flag(parser)
     add_global_flags(parser, "runs_dir", "join", "access_dir")
     add_flags(parser, RunConfig)

@@ -57,8 +57,9 @@ class BatchRecords:
         self._journal.write(
             "UPDATE batch SET errors = ?, state = CASE state WHEN 'running' THEN 'complete' ELSE state END "
             "WHERE id = ?",
-            json.dumps(errors), batch_id,
-        )  # fmt: skip
+            json.dumps(errors),
+            batch_id,
+        )
 
     def count(self) -> int:
         """How many batches were ever submitted."""

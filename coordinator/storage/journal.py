@@ -285,8 +285,9 @@ class Journal(JournalConnection):
         """One of the last two generations, with the population that was sampled; `None` if its state is deleted."""
         row = self.read_row(
             "SELECT state, seeds, generation.seconds, strategy.checksum FROM generation JOIN strategy "
-            "ON number = strategy.generation WHERE number = ?", number
-        )  # fmt: skip
+            "ON number = strategy.generation WHERE number = ?",
+            number,
+        )
         if row is None:
             return None
         if row[-1] not in (None, state_checksum(number, row[0])):

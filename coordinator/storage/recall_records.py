@@ -99,8 +99,9 @@ class RecallRecords:
         write(
             "UPDATE generation SET closed = NULL, mean = NULL, std = NULL, best = NULL, worst = NULL, steps = NULL, "
             "failed = 0, checksum = NULL, seeds = ? WHERE number = ?",
-            json.dumps(list(seeds)), number,
-        )  # fmt: skip
+            json.dumps(list(seeds)),
+            number,
+        )
         self._checksums.write_state(number, state)
         self._journal.opened = number
         self._settle_recall()
@@ -164,8 +165,9 @@ class RecallRecords:
         self._journal.write(
             f"INSERT INTO recalled ({COLUMNS}, because, happened, was_closed) SELECT {COLUMNS}, '{because}', ?, "  # noqa: S608
             f"{WAS_CLOSED} FROM result WHERE {where}",
-            time(), *values,
-        )  # fmt: skip
+            time(),
+            *values,
+        )
         self._journal.write(f"DELETE FROM result WHERE {where}", *values)  # noqa: S608
 
     def _count_again(self, generation: int, where: str, *values: object) -> None:

@@ -218,9 +218,7 @@ def _describe_failures(request: RunRequest, failed: int) -> str:
     return f"; {plural(failed, 'candidate')} failed, first: {errors[0] if errors else 'its error is not kept'}"
 
 
-def _report(
-    args: argparse.Namespace, run: Run, request: RunRequest, outcome: ExitReport, *, nothing_new: bool
-) -> None:  # fmt: skip
+def _report(args: argparse.Namespace, run: Run, request: RunRequest, outcome: ExitReport, *, nothing_new: bool) -> None:
     from dreamfleet.common.protocol.stop_kind import StopKind
     from dreamfleet.common.runs.records import describe_score, in_values, with_error
     from dreamfleet.common.runs.run_folder import open_run

@@ -141,7 +141,7 @@ BEST = StoredEvaluation(4, 16, 120.5, 30.25)
 STATUS = Status(
     schema=2, run="night", run_uid=UID, incarnation=3, package="0.1.0", state="running", why="",
     settings=RunSettings(SPEC, ControllerShape(288, 3), 4, 2, 0.1, "diagonal", 1, 5, 16), limits={"generations": 100},
-    uptime=99.5, generation=GenerationStatus(7, 3, 8, 2.5, 0.09, None), generations=7, last=CLOSED, recent=(CLOSED,),
+    uptime=99.5, generation=GenerationStatus(3, 8, 7, 2.5, 0.09, None), generations=7, last=CLOSED, recent=(CLOSED,),
     population=Population(7, 0, 4, (2, 1, 0, 0), (2, 2, 2, 2), (101.5, -3.25, None, None)),
     last_population=Population(6, 0, 4, (2, 2, 2, 2), (2, 2, 2, 2), (140.0, 112.0, 122.5, -12.5)),
     evaluation=BEST, best=BEST, evaluations=1, evaluating=EpisodeProgress(0, 0), collecting=EpisodeProgress(8, 8),

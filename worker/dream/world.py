@@ -109,9 +109,7 @@ class DreamWorld:
         reward, done = self.judge(dream.reward, dream.done, draw.bar)
         return DreamtStep(dream.latent, dream.state, reward, done, dream.action)
 
-    def judge(
-        self, reward: Floats, done: Floats, bar: Floats | None
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:  # fmt: skip
+    def judge(self, reward: Floats, done: Floats, bar: Floats | None) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """The reward of each dream's step and whether it ends `(N,)`, by the heads' outputs `(N,)`; `bar` of a draw."""
         ended = self._ends.are_reached(done, bar)
         value = self._value(reward.astype(np.float64), ended)

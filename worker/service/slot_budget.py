@@ -88,8 +88,9 @@ class SlotBudget:
     def next_runs(self, run: int, now: float) -> list[int]:
         """The runs other than `run` that may take a slot now."""
         self._charge(now)
-        return [each for each in self._accounts if each != run and self._accounts[each].wanted
-                and self._may_take(each, now)]  # fmt: skip
+        return [
+            each for each in self._accounts if each != run and self._accounts[each].wanted and self._may_take(each, now)
+        ]
 
     def allowance(self, run: int, now: float) -> int:
         """The slots that a run can count on: its part by share, and what the others leave."""

@@ -118,8 +118,9 @@ class Task:
         return self.make_environment(assignment)
 
     def make_watched_environment(
-        self, assignment: Assignment  # noqa: ARG002 - subclasses use it
-    ) -> gymnasium.Env[Any, Any] | None:  # fmt: skip
+        self,
+        assignment: Assignment,  # noqa: ARG002 - subclasses use it
+    ) -> gymnasium.Env[Any, Any] | None:
         """A new environment that candidates are scored in while somebody watches, for tasks that observe no pictures.
 
         It must give the same scores to the bit; its `render` gives pictures and changes nothing else. `None`: there is

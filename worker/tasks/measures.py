@@ -46,7 +46,7 @@ class Measurer:
 
     def __init__(
         self, names: Sequence[str], actions: Actions, action_names: Sequence[str], truth: Truth | None = None
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.names, self.truth = tuple(names), truth
         self._actions = actions
         words = action_names or [f"action{number}" for number in range(action_count(actions))]

@@ -85,8 +85,9 @@ def warn_of_unsure_ends(rule: EndRule, quality: Mapping[str, float]) -> None:
         log.warning(
             "this model hardly separates ends from other steps (area under the curve %.2f, 0.5 is chance). Dreams that "
             "end above %g may never end; `bundle --end drawn` ends them as often as they end in the world",
-            area, rule.at,
-        )  # fmt: skip
+            area,
+            rule.at,
+        )
 
 
 def _warn_of_gaps(source: Source, recorded: RecordedRewards) -> None:

@@ -87,8 +87,9 @@ def train_vae(
         log.warning(
             "held-out pictures are nearer to their mean (squared error %.4g) than to this VAE's reconstructions "
             "(%.4g): it is not good enough to evolve on; give it more --updates",
-            figures["mean_picture_error"], figures["reconstruction_error"],
-        )  # fmt: skip
+            figures["mean_picture_error"],
+            figures["reconstruction_error"],
+        )
     return figures
 
 

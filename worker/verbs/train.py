@@ -30,17 +30,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", default="cpu", help="cpu, cuda, or auto (default cpu)")
     parser.add_argument("--continue-from", type=Path, metavar="FILE", help="begin from this checkpoint's weights")
     parser.add_argument(
-        "--new", action="store_true",
+        "--new",
+        action="store_true",
         help="begin anew: delete the folder's checkpoint, its curve and the checkpoints that keep_every kept",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--decoder-only", action="store_true",
+        "--decoder-only",
+        action="store_true",
         help="of vae: leave the encoder, and so latents and controllers, as they are",
-    )  # fmt: skip
+    )
     parser.add_argument(
-        "--summary", action="store_true",
+        "--summary",
+        action="store_true",
         help="print layers and parameters without training; a model to continue from must have these layers",
-    )  # fmt: skip
+    )
     parser.add_argument(
         "--tensorboard", type=Path, metavar="FOLDER", help="also write the losses there as TensorBoard events"
     )

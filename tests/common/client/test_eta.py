@@ -19,7 +19,7 @@ def status(limits=(), seconds=0.0, gone=0.0, **changes):
     return dataclasses.replace(
         STATUS, limits={"generations": 0, "steps": 0, "minutes": 0.0, "target": None, "parted": 0, **dict(limits)},
         recent=recent, throughput=Throughput(1000.0, changes.pop("steps", 448_000), seconds),
-        **{"generation": GenerationStatus(7, 3, 8, gone, 0.09, None), **changes},
+        **{"generation": GenerationStatus(3, 8, 7, gone, 0.09, None), **changes},
     )  # fmt: skip
 
 

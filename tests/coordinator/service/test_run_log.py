@@ -16,7 +16,7 @@ def test_the_summary_shows_generation_score_speed_workers_and_time_left():
     text, facts = summary(status)
     parts = "7: 3 of 8 episodes", "120.5 ± 7.8", "988 steps/s", "1 worker", "8 slots", "18 of 30 minutes", "12 min"
     assert [part for part in parts if part not in text] == []
-    assert (facts["event"], facts["generation"], facts["workers"]) == ("summary", 7, 1)
+    assert (facts["generation"], facts["workers"]) == (7, 1)
     assert summary(dataclasses.replace(STATUS, best=None))[1]["best"] is None
 
 

@@ -20,7 +20,7 @@ from dreamfleet.worker.service.membership import (
 )
 
 BEAT = 1.0
-TIMEOUT = SILENT_BEATS * BEAT
+SILENCE = SILENT_BEATS * BEAT
 TIMEOUT = 60.0  # of a coordinator out of sight
 IDLE = WorkerLoad(idle=True, awaits_verdict=False, uploading=False)
 
@@ -175,7 +175,7 @@ class AnyOrder(RuleBasedStateMachine):
     @rule(hands=hands, answers=st.booleans(), pause=st.floats(0.1, 2.0))
     def it_asks_if_it_must(self, hands, answers, pause):
         must = self.member.must_rejoin(self.now, hands)
-        timeout = TIMEOUT + (UPLOAD_GRACE if hands.uploading else 0)
+        timeout = SILENCE + (UPLOAD_GRACE if hands.uploading else 0)
         forgotten = self.now - self.spoke > timeout and (hands.idle or hands.awaits_verdict)
         reason = self.doubt or self.of not in self.seen or forgotten
         assert must == (bool(self.seen) and self.now >= self.allowed and reason)
@@ -204,7 +204,7 @@ class AnyOrder(RuleBasedStateMachine):
         self.now = max(self.now, self.allowed)
         self.it_asks_if_it_must(IDLE, answers=True, pause=1.0)
         self.the_coordinator_speaks()
-        self.now += TIMEOUT / 2
+        self.now += SILENCE / 2
         assert not self.member.must_rejoin(self.now, IDLE)
 
     @invariant()
