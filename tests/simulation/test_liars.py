@@ -60,7 +60,13 @@ def test_a_race_that_lies_decided_is_decided_again(lie, seed):
         (fleet(3), {0: by_chance(0.5, 0)}, OWN),
         (fleet(3, first_stage=2, first_score=1.4, anew=True), HALF, ()),
     ],
-    ids=["a late liar", "no trusted host", "two held until a third comes", "the coordinator's own host", "a stage by score"],
+    ids=[
+        "a late liar",
+        "no trusted host",
+        "two held until a third comes",
+        "the coordinator's own host",
+        "a stage by score",
+    ],
 )
 def test_whoever_it_is_a_third_host_decides_and_the_run_goes_back_to_where_it_came(schedule, lies, trusted):
     assert_barred(schedule, lies, trusted)

@@ -1,6 +1,6 @@
 """What tasks offer, and how they are found by name.
 
-Tests api.py, assignment.py, batches.py, model_free_policies.py, common/protocol/tasks.py and worker/scoring/scorer.py.
+Tests api.py, batches.py, model_free_policies.py, common/protocol/tasks.py and worker/scoring/scorer.py.
 """
 
 from dataclasses import replace
