@@ -5,36 +5,32 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.command_line import SimpleVerb
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
 from dreamfleet.common.cli.presets import check_preset, preset_help_text
+from dreamfleet.common.cli.progress import progress_bar
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path
+from dreamfleet.common.host.stop_signals import stop_on_signals
 from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.printable import plural
-
-if TYPE_CHECKING:
-    from dreamfleet.worker.addons.baselines.progress import TrainingReport
-
+from dreamfleet.worker.addons.baselines.presets import CHECKPOINT, DRQN, NAMES, PRESETS
+from dreamfleet.worker.addons.baselines.progress import TrainingReport
+from dreamfleet.worker.training.config_flags import add_config_flags, add_settings_flag, apply_settings
+from dreamfleet.worker.training.stages.train import explain_interrupt
 
 LEARNING_FLAGS = ("episodes", "steps", "seed")  # other settings are keys of --set
 TABLE = "baseline"
 
 
 def _check_learns(agent: str, hint: str) -> None:
-    from dreamfleet.worker.addons.baselines.presets import DRQN
-
     if agent != DRQN:
         raise UsageError(f"{agent} learns nothing: {hint}")
 
 
 def configure_train(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `baseline train`."""
-    from dreamfleet.worker.addons.baselines.presets import NAMES, PRESETS
-    from dreamfleet.worker.training.config_flags import add_config_flags, add_settings_flag
-
     parser.add_argument("agent", choices=NAMES, help="drqn; random drivers learn nothing")
     parser.add_argument("--data", type=Path, required=True, help="folder of the training and of the trained network")
     parser.add_argument("--preset", default="learning", help=f"{preset_help_text('baseline')} (default learning)")
@@ -48,18 +44,11 @@ def configure_train(parser: argparse.ArgumentParser) -> None:
 
 def train_baseline(args: argparse.Namespace) -> int:
     """Train, with a report every few episodes on stderr, and print the figures."""
-    from dreamfleet.worker.addons.baselines.presets import DRQN, PRESETS
-    from dreamfleet.worker.training.config_flags import apply_settings
-
     _check_learns(args.agent, f"`dreamfleet evaluate --controller {args.agent}` judges it")
     preset = PRESETS[check_preset("baseline", args.preset)]
     config, layers = apply_settings((preset.learning, preset.agent), TABLE, args)
     draw_unseen()
-    from dreamfleet.common.cli.progress import progress_bar
-    from dreamfleet.common.host.stop_signals import stop_on_signals
-    from dreamfleet.worker.addons.baselines.presets import CHECKPOINT
     from dreamfleet.worker.addons.baselines.train import train_drqn
-    from dreamfleet.worker.training.stages.train import explain_interrupt
     from dreamfleet.worker.training.training_state import select_device
 
     def report_progress(episodes: int, report: TrainingReport | None) -> None:
@@ -81,8 +70,6 @@ def train_baseline(args: argparse.Namespace) -> int:
 
 def configure_export(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `baseline export`."""
-    from dreamfleet.worker.addons.baselines.presets import NAMES
-
     parser.add_argument("agent", choices=NAMES, help="drqn; a random driver has nothing to export")
     parser.add_argument("--data", type=Path, required=True, help="the folder of its training")
     parser.add_argument("--out", type=Path, required=True, help="the file to write, NAME.zip")

@@ -8,11 +8,15 @@ from pathlib import Path
 
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer
+from dreamfleet.common.cli.progress import progress_bar
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.stop_signals import stop_on_signals
 from dreamfleet.common.host.unseen_drawing import draw_unseen
+from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
+from dreamfleet.worker.addons.card.card_page import CardContents
+from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
 from dreamfleet.worker.addons.recording.verb import MOST_STEPS
 
 SUMMARY = "write a controller as a folder to publish: a model card, scores, a video, ONNX, a script without dreamfleet"
@@ -40,11 +44,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--steps must be 0 or more")
     pin_thread_pools()
     draw_unseen()
-    from dreamfleet.common.cli.progress import progress_bar
-    from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
     from dreamfleet.worker.addons.card.card import write_card
-    from dreamfleet.worker.addons.card.card_page import CardContents
-    from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
 
     check_modules(("onnx", "matplotlib", "av"))
     controller, beside = find_controller(args.controller, args.runs_dir)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import argparse
 from secrets import randbelow
 
+from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.printable import format_number, plural
 
 SUMMARY = "drive yourself by keyboard, on the track or in a world model's dream"
 EXTRAS = ("worker",)
@@ -30,9 +33,6 @@ def run(args: argparse.Namespace) -> int:
     """Drive, and print each episode's score."""
     if not args.dream and (args.bundle is not None or args.temperature is not None):
         raise UsageError("--bundle and --temperature need a dream: add --dream")
-    from dreamfleet.common.artifacts.bundle_store import find_bundle
-    from dreamfleet.common.artifacts.driving import FIRST_WORLD
-    from dreamfleet.common.printable import format_number, plural
     from dreamfleet.worker.addons.driving.loop import DreamScene, DrivingConfig, Scene, drive, make_scene
 
     config = DrivingConfig(randbelow(10_000) if args.seed is None else args.seed, args.steps, args.scale)

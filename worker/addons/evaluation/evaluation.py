@@ -9,6 +9,7 @@ from contextlib import suppress
 from statistics import fmean
 from time import perf_counter
 
+from dreamfleet.common.cli.progress import progress_bar
 from dreamfleet.common.errors import DreamfleetError, StoppedError
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.host.packages import package_version
@@ -96,8 +97,6 @@ def judge(
     `name` is the agent's in the report. `StoppedError` for a Ctrl-C once an episode has a score: it says the mean of
     those that have.
     """
-    from dreamfleet.common.cli.progress import progress_bar
-
     began, episodes, scores = perf_counter(), list[Episode](), list[float]()
     with progress_bar("evaluate", len(seeds), "episodes") as bar:
         try:

@@ -8,14 +8,20 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dreamfleet.common.addons.analysis.elites import find_elite
 from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
 from dreamfleet.common.cli.key_values import ENVIRONMENT_EXAMPLE, parse_arguments
 from dreamfleet.common.cli.output import print_next
+from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, open_output
-from dreamfleet.common.host.resource_limits import pin_thread_pools, usable_cores
+from dreamfleet.common.host.resource_limits import usable_cores
+from dreamfleet.common.runs.lookup import find_bundle_of
 from dreamfleet.common.runs.seeds import TEST
+from dreamfleet.worker.addons.evaluation.evaluation_report import check_seed_range
+from dreamfleet.worker.addons.evaluation.named_agents import find_driver, is_random
+from dreamfleet.worker.service.bundle_fetch import fetch_bundle_of
 
 if TYPE_CHECKING:
     from dreamfleet.worker.addons.evaluation.agents import Agent
@@ -68,8 +74,6 @@ def add_random_flags(parser: argparse.ArgumentParser) -> None:
 
 def named_agent(args: argparse.Namespace) -> Agent:
     """The agent of `--controller`; a note on stderr names the world of random actions."""
-    from dreamfleet.worker.addons.evaluation.named_agents import find_driver, is_random
-
     arguments = parse_arguments("--environment", args.environment, ENVIRONMENT_EXAMPLE)
     options = {"environment": arguments} if arguments else {}
     agent = find_driver(args.controller, args.runs_dir, args.bundle, args.task, options)
@@ -89,9 +93,7 @@ def agent_flags(args: argparse.Namespace) -> tuple[object, ...]:
 
 def run(args: argparse.Namespace) -> int:
     """Drive, and print the scores."""
-    pin_thread_pools()  # of NumPy, which is not loaded yet: its threads take three times the time of a drive otherwise
     from dreamfleet.worker.addons.evaluation.evaluation import judge
-    from dreamfleet.worker.addons.evaluation.evaluation_report import check_seed_range
 
     if args.episodes < 1 or args.first_seed < 0 or args.jobs < 1:
         raise UsageError("--episodes and --jobs must be at least 1, --first-seed at least 0")
@@ -115,11 +117,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _choose_agent(args: argparse.Namespace) -> tuple[str, Agent]:
-    from dreamfleet.common.addons.analysis.elites import find_elite
-    from dreamfleet.common.client.client import Client
-    from dreamfleet.common.runs.lookup import find_bundle_of
     from dreamfleet.worker.addons.evaluation.agents import make_agent
-    from dreamfleet.worker.service.bundle_fetch import fetch_bundle_of
 
     live = bool(args.run_name) or bool({"connect", "join"} & args.given)
     if (args.task or args.environment) and (not args.controller or args.cell is not None):

@@ -13,6 +13,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, reporting_write_errors
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.printable import plural
+from dreamfleet.worker.addons.importing import sources
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -60,32 +61,24 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"nothing at {args.source}")
     if args.out.is_file() and args.out.resolve().is_relative_to(args.source.resolve()):
         raise UsageError(f"--out {args.out} would replace a file of the source: choose another")
-    from dreamfleet.worker.addons.importing.sources import (
-        drive_paths,
-        holds_checkpoints,
-        holds_json_model,
-        refuse_unreadable,
-    )
-
     source: Path = args.source
-    if source.is_dir() and holds_checkpoints(source):
+    if source.is_dir() and sources.holds_checkpoints(source):
         return _import_world_model(args)
-    refuse_unreadable(source)
-    if source.is_dir() and holds_json_model(source):
+    sources.refuse_unreadable(source)
+    if source.is_dir() and sources.holds_json_model(source):
         return _import_world_model(args)
-    if source.suffix == ".npz" or (source.is_dir() and drive_paths(source)):
+    if source.suffix == ".npz" or (source.is_dir() and sources.drive_paths(source)):
         return _import_drives(args)
     return _import_controller(args)
 
 
 def _import_world_model(args: argparse.Namespace) -> int:
     from dreamfleet.worker.addons.importing.bundles import import_checkpoints, import_json_model
-    from dreamfleet.worker.addons.importing.sources import CONTROLLER, find_checkpoint, holds_checkpoints
 
     check_output_path(args.out)
-    write = import_checkpoints if holds_checkpoints(args.source) else import_json_model
+    write = import_checkpoints if sources.holds_checkpoints(args.source) else import_json_model
     bundle = write(args.source, args.out)
-    controller = find_checkpoint(args.source, CONTROLLER)
+    controller = sources.find_checkpoint(args.source, sources.CONTROLLER)
     text = (
         f"{bundle.path}: a world model of {bundle.manifest.task}, controllers of {bundle.controller_shape.size} "
         f"parameters, sha256 {bundle.sha256}; `dreamfleet import {controller or 'VECTOR.json'} --bundle {args.out} "
@@ -128,10 +121,9 @@ def _read_controller(args: argparse.Namespace) -> Controller:
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.common.artifacts.controller import IMPORTED, Controller
     from dreamfleet.common.artifacts.driving import FIRST_WORLD
-    from dreamfleet.worker.addons.importing.sources import checkpoint_of
     from dreamfleet.worker.addons.importing.vectors import to_parameters
 
-    checkpoint = checkpoint_of(args.source)
+    checkpoint = sources.checkpoint_of(args.source)
     if checkpoint is not None and args.layout not in (None, "ctallec"):
         raise UsageError(f"{checkpoint} is of the layout ctallec: omit --layout")
     vector, world_command = _read_numbers(args.source, checkpoint)

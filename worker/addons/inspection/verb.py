@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
+from dreamfleet.common.cli.progress import progress_bar
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.runs.seeds import VALIDATION
@@ -112,7 +113,6 @@ def _draw_page(args: argparse.Namespace) -> int:
         raise UsageError("--steps must be at least 2 and --seed at least 0")
     if args.action and args.controller:
         raise UsageError("only one can drive: give --controller or --action")
-    from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.worker.addons.inspection.encoded_rollout import DriveConfig
     from dreamfleet.worker.addons.inspection.page_builder import write_page
     from dreamfleet.worker.addons.inspection.subject import find_subject

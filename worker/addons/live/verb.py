@@ -9,17 +9,23 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
+from dreamfleet.common.addons.frames.live import LiveView
 from dreamfleet.common.cli.global_config import add_global_flags, add_run_argument, resolve_network
 from dreamfleet.common.cli.output import add_json_flag, print_answer
+from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.add_ons import add_on
+from dreamfleet.common.host.stop_signals import stop_on_signals
 from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.printable import one_line, plural
+from dreamfleet.common.protocol.tasks import DREAM
+from dreamfleet.common.runs.lookup import find_bundle_of, find_evaluated_mean, naming_the_stored_run
 from dreamfleet.common.runs.seeds import TEST
+from dreamfleet.worker.addons.evaluation.known_score import first_seed
 from dreamfleet.worker.addons.evaluation.verb import add_random_flags, named_agent
+from dreamfleet.worker.service.bundle_fetch import fetch_bundle_now, fetch_bundle_of
 
 if TYPE_CHECKING:
-    from dreamfleet.common.client.client import Client
     from dreamfleet.worker.addons.live.frame_sinks import SendFrame
     from dreamfleet.worker.addons.live.live_sources import Driver
     from dreamfleet.worker.addons.live.live_view import CaptionedFrame
@@ -65,7 +71,6 @@ def run(args: argparse.Namespace) -> int:
     _check(args)
     if args.out is not None:
         draw_unseen()
-    from dreamfleet.common.host.stop_signals import stop_on_signals
 
     with ExitStack() as stack:
         show = stack.enter_context(_open_sink(args))  # what cannot be shown is said before anything is asked
@@ -117,9 +122,6 @@ def _window(name: str) -> Iterator[SendFrame]:
 
 @contextmanager
 def _open_pictures(args: argparse.Namespace) -> Iterator[Iterator[CaptionedFrame | None]]:
-    from dreamfleet.common.client.client import Client
-    from dreamfleet.common.runs.lookup import naming_the_stored_run
-
     if args.controller:
         yield _drive_pictures(args, _named_driver(args))
         return
@@ -135,11 +137,8 @@ def _open_pictures(args: argparse.Namespace) -> Iterator[Iterator[CaptionedFrame
 @contextmanager
 def _worker_pictures(args: argparse.Namespace, client: Client) -> Iterator[Iterator[CaptionedFrame | None]]:
     """Pictures of what a worker of the run scores."""
-    from dreamfleet.common.addons.frames.live import LiveView
-    from dreamfleet.common.protocol.tasks import DREAM
     from dreamfleet.worker.addons.live.live_sources import worker_frames
     from dreamfleet.worker.addons.live.live_view import LiveCanvas, LiveDreamer
-    from dreamfleet.worker.service.bundle_fetch import fetch_bundle_now
 
     with LiveView(client, args.run_name, args.worker) as view:
         spec = view.status.settings.task
@@ -160,7 +159,6 @@ def _worker_pictures(args: argparse.Namespace, client: Client) -> Iterator[Itera
 
 def _drive_pictures(args: argparse.Namespace, driver: Callable[[], Driver]) -> Iterator[CaptionedFrame]:
     """A controller's drives: into files as fast as possible, elsewhere at `--fps`."""
-    from dreamfleet.worker.addons.evaluation.known_score import first_seed
     from dreamfleet.worker.addons.live.live_sources import driven_frames, limit_rate
     from dreamfleet.worker.addons.recording.parallel_dream import ParallelDreamConfig
 
@@ -175,7 +173,6 @@ def _drive_pictures(args: argparse.Namespace, driver: Callable[[], Driver]) -> I
 
 def _best_driver(client: Client, run: str) -> Driver:
     from dreamfleet.worker.addons.evaluation.agents import make_agent
-    from dreamfleet.worker.service.bundle_fetch import fetch_bundle_of
 
     reported = client.controller(run)
     facts = {"run": run, "generation": reported.provenance.get("generation")}
@@ -183,7 +180,6 @@ def _best_driver(client: Client, run: str) -> Driver:
 
 
 def _named_driver(args: argparse.Namespace) -> Callable[[], Driver]:
-    from dreamfleet.common.runs.lookup import find_bundle_of, find_evaluated_mean
     from dreamfleet.worker.addons.evaluation.agents import make_agent
 
     if args.generation is not None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
+from dreamfleet.common.cli.progress import progress_bar
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.files.atomic_write import check_output_path
 from dreamfleet.common.host.packages import PACKAGES, check_modules
@@ -18,6 +19,7 @@ from dreamfleet.common.host.unseen_drawing import describe_choice, draw_unseen
 from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.seeds import TEST
 from dreamfleet.common.worlds.score_words import profile_of
+from dreamfleet.worker.addons.evaluation.known_score import first_seed
 from dreamfleet.worker.addons.evaluation.verb import CONTROLLER, add_random_flags, agent_flags, named_agent
 
 if TYPE_CHECKING:
@@ -82,8 +84,6 @@ def video_paths(args: argparse.Namespace, default_seed: int) -> dict[int, Path]:
 
 def _record_videos(args: argparse.Namespace, agent: Agent, record_here: Recorder) -> None:
     """Record one video after another and print each score; Ctrl-C ends the current video and the verb."""
-    from dreamfleet.common.cli.progress import progress_bar
-    from dreamfleet.worker.addons.evaluation.known_score import first_seed
     from dreamfleet.worker.addons.recording.recording import record_in_process
 
     profile, known, world = profile_of(agent.reality), agent.known_score, agent.world

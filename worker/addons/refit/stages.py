@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+from dreamfleet.common.cli.progress import progress_bar
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, reporting_write_errors
 from dreamfleet.common.host.resource_limits import pin_thread_pools
@@ -66,7 +67,6 @@ def refit_controller(request: RefitRequest, stop: Stop = never_stop) -> RefitRep
     pin_thread_pools()  # of NumPy, which a verb has not loaded yet
     check_output_path(request.out)
     from dreamfleet.common.artifacts.bundle_store import find_bundle
-    from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
     from dreamfleet.worker.addons.refit.refit import output_names, refit
     from dreamfleet.worker.training.data.dataset import episode_paths
@@ -132,7 +132,6 @@ def fit_subspace(request: SubspaceRequest, stop: Stop = never_stop) -> SubspaceR
     pin_thread_pools()  # of NumPy, which a verb has not loaded yet
     check_output_path(request.out)
     from dreamfleet.common.artifacts.bundle_store import find_bundle
-    from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.worker.addons.refit.fit_subspace import find_subspace
     from dreamfleet.worker.training.data.dataset import episode_paths
 

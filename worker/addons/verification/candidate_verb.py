@@ -7,15 +7,17 @@ import json
 import math
 import re
 import sys
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from dreamfleet.common.cli.config import load
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.printable import one_line, plural
-
-if TYPE_CHECKING:
-    from dreamfleet.common.protocol.failures import Failure
-    from dreamfleet.worker.addons.verification.replay import ReplayedEpisode
+from dreamfleet.common.protocol.failures import Failure
+from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.worker.addons.verification.replay import ReplayedEpisode, replay
+from dreamfleet.worker.service.config import WorkerConfig
 
 SUMMARY = "score a run's candidate again and compare with the journal, bit by bit on a host of the same class"
 EXTRAS = ("worker",)
@@ -33,13 +35,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay each episode; exit 1 if one differs, or if this host can check none."""
-    import numpy as np
-
-    from dreamfleet.common.cli.config import load
-    from dreamfleet.common.runs.run_folder import open_run
-    from dreamfleet.worker.addons.verification.replay import replay
-    from dreamfleet.worker.service.config import WorkerConfig
-
     found = re.fullmatch(r"(\d{1,12})/(\d{1,12})", args.candidate)
     if not found:
         raise UsageError(f"--candidate {args.candidate!r}: write generation/index, such as 3/0")

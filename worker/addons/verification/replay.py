@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.host.fingerprint import fingerprint
@@ -17,6 +20,7 @@ from dreamfleet.common.host.stall_watch import STALL_SECONDS
 from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_from_fingerprint
+from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import check_task_trusted
 from dreamfleet.common.runs.own_runs import trust_own_run
 from dreamfleet.common.runs.records import StoredFailure, StoredResult
@@ -25,13 +29,9 @@ from dreamfleet.common.runs.stages import Stage
 from dreamfleet.worker.scoring.failure_cause import crash, failure_of
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from dreamfleet.common.protocol.messages import TaskSpec
     from dreamfleet.worker.scoring.scorer import Scorer
 
-    Item = tuple[int, NDArray[np.float32], int, TaskSpec]  # episode, parameters, seed and how it is driven
+Item = tuple[int, NDArray[np.float32], int, TaskSpec]  # episode, parameters, seed and how it is driven
 
 
 @dataclass(frozen=True)

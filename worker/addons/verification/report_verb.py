@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import BundleError, ControllerError, UsageError
-from dreamfleet.common.host.resource_limits import pin_thread_pools, usable_cores
+from dreamfleet.common.host.resource_limits import usable_cores
+from dreamfleet.common.runs.lookup import find_agent, find_bundle_of
+from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport, read_evaluation_report
+from dreamfleet.worker.addons.evaluation.named_agents import is_random, make_random_agent
+from dreamfleet.worker.addons.verification.reproduction import Reproduction
 
 if TYPE_CHECKING:
     from dreamfleet.worker.addons.evaluation.agents import Agent
-    from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
-    from dreamfleet.worker.addons.verification.reproduction import Reproduction
 
 SUMMARY = "drive recorded controllers again on their recorded seeds, and compare with what `evaluate --out` wrote"
 EXTRAS = ("worker",)
@@ -36,9 +38,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check each report; exit 1 if a score differs."""
-    pin_thread_pools()  # of NumPy, which is not loaded yet
-    from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
-
     if args.jobs < 1 or (args.episodes is not None and args.episodes < 1):
         raise UsageError("--episodes and --jobs must be at least 1")
     recorded = [read_evaluation_report(each) for each in args.reports]
@@ -51,7 +50,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _reproduce(args: argparse.Namespace, path: Path, recorded: EvaluationReport) -> Reproduction:
     from dreamfleet.worker.addons.evaluation.evaluation import judge
-    from dreamfleet.worker.addons.verification.reproduction import Reproduction
 
     agent = _find_recorded_agent(args, path, recorded)
     seeds, note = recorded.results.seeds[: args.episodes], partial(print, file=sys.stderr)
@@ -60,9 +58,7 @@ def _reproduce(args: argparse.Namespace, path: Path, recorded: EvaluationReport)
 
 
 def _find_recorded_agent(args: argparse.Namespace, path: Path, recorded: EvaluationReport) -> Agent:
-    from dreamfleet.common.runs.lookup import find_agent, find_bundle_of
     from dreamfleet.worker.addons.evaluation.agents import make_agent
-    from dreamfleet.worker.addons.evaluation.named_agents import is_random, make_random_agent
 
     if is_random(recorded.name, args.runs_dir):
         return make_random_agent(recorded.name, recorded.task, json.loads(recorded.options or "{}"))
