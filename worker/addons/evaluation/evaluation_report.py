@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from msgspec import Meta
 
@@ -19,7 +19,6 @@ from dreamfleet.common.runs.standard_error import format_with_error, score_digit
 from dreamfleet.common.schema.validation import OPTIONAL, MalformedError, Seconds, from_plain_lenient
 
 GYMNASIUM = "gymnasium"  # the judge of worlds that gymnasium itself has
-FORMER_MARKS = (800.0, 900.0)  # of reports that name none: only drives with laps were compared with them
 MAX_MARKS = 8
 MIN_EPISODES_TO_SOLVE = 100  # customary number of episodes for gymnasium's threshold of solving an environment
 MAX_BYTES, MAX_EPISODES, MAX_SEED = 64 << 20, 10**5, 2**63
@@ -45,7 +44,7 @@ class EvaluationReport:
     #: episodes without a score; every statistic leaves them out
     failed: Annotated[tuple[FailedEpisode, ...], Meta(max_length=MAX_EPISODES)] = field(default=(), metadata=OPTIONAL)
     #: scores of which the share of episodes above them is reported
-    marks: Annotated[tuple[float, ...], Meta(max_length=MAX_MARKS)] = field(default=FORMER_MARKS, metadata=OPTIONAL)
+    marks: Annotated[tuple[float, ...], Meta(max_length=MAX_MARKS)] = field(default=(), metadata=OPTIONAL)
     #: of `task`, as a run freezes them
     options: str = field(default="", metadata=OPTIONAL)
 
@@ -55,21 +54,25 @@ class EvaluationReport:
         return EpisodeResults(self.drives, self.failed)
 
     def to_json(self) -> str:
-        """One line of JSON: the statistics, then all fields."""
-        fields = asdict(self)
-        if self.marks == FORMER_MARKS:  # as ever, to the byte
-            del fields["marks"]
-        if not self.options:
-            del fields["options"]
-        return json.dumps({**summary_figures(self.results, self.marks), **fields}, allow_nan=False)
+        """One line of JSON: the statistics, then all fields; a statistic that is unknown is null."""
+        results = self.results
+        figures = {
+            "n": len(results.drives), "mean": results.mean, "std": results.std, "error": results.error,
+            "median": results.median, "least": results.worst, "most": results.best, "steps": results.steps,
+            "finished": results.finished, "speed": results.speed, "braking": results.braking,
+            **{f"above_{mark:g}": results.above(mark) for mark in self.marks},
+            "scores": results.scores, "seeds": results.seeds,
+        }  # fmt: skip
+        return json.dumps({**figures, **asdict(self)}, allow_nan=False)
 
     def describe(self, word: str = "seed") -> str:
         """A text for display: the score, figures on driving, the threshold and the controller; `word`: one seed."""
         failures = self.results.failure_text
+        above = [f"above {mark:g}: {self.results.above(mark):.0%}" for mark in self.marks]
         lines = (
             failures and f"{failures}; all figures are over the episodes with a score",
             self._describe_score(word),
-            ", ".join([*self._describe_marks(), *_describe_driving(self.results)]),
+            ", ".join([*above, *_describe_driving(self.results)]),
             self._describe_threshold(word),
             self._describe_origin(),
         )
@@ -103,26 +106,10 @@ class EvaluationReport:
             f"deviation {std}; judged {judged}"
         )
 
-    def _describe_marks(self) -> list[str]:
-        if self.marks == FORMER_MARKS and self.results.finished is None:
-            return []
-        return [f"above {mark:g}: {self.results.above(mark):.0%}" for mark in self.marks]
-
     def _describe_origin(self) -> str:
         model = f", world model {self.bundle[:12]}" if self.bundle else ""
         made = f"{self.results.steps:,} environment steps in {self.seconds:.0f} s"
         return f"{made}; controller {self.controller[:12]}{model}; dreamfleet {one_line(self.version)}"
-
-
-def summary_figures(results: EpisodeResults, marks: tuple[float, ...] = FORMER_MARKS) -> dict[str, Any]:
-    """The statistics of episodes as JSON has them; `std`, `error`, `finished`, `speed` and `braking` may be `None`."""
-    return {
-        "n": len(results.drives), "mean": results.mean, "std": results.std, "error": results.error,
-        "median": results.median, "least": results.worst, "most": results.best, "steps": results.steps,
-        "finished": results.finished, "speed": results.speed, "braking": results.braking,
-        **{f"above_{mark:g}": results.above(mark) for mark in marks},
-        "scores": results.scores, "seeds": results.seeds,
-    }  # fmt: skip
 
 
 def read_evaluation_report(path: Path) -> EvaluationReport:
