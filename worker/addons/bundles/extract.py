@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.host.stop_signals import Stop, never_stop
 from dreamfleet.worker.training.stages import StageReport
 
@@ -31,7 +32,6 @@ class ExtractReport(StageReport):
 
 def extract_models(request: ExtractRequest, _stop: Stop = never_stop) -> ExtractReport:
     """Write the checkpoints; errors as in `unbundle`."""
-    from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.worker.addons.bundles.unbundle import unbundle
 
     bundle = find_bundle(request.bundle)

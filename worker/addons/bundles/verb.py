@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.world_facts import EndRule
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
 from dreamfleet.common.errors import UsageError
@@ -95,7 +96,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _round_to_eight_bits(name: str, out: Path) -> BundleReport:
-    from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.worker.addons.bundles.eight_bits import write_eight_bit_bundle
 
     check_output_path(out)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from dreamfleet.common.addons.analysis.fitness_chart import PLOT_COLOURS, draw_fitness, has_score_panel
@@ -222,8 +222,6 @@ def _scale(panel: Any, lines: Sequence[NDArray[np.float64]]) -> None:
         panel.yaxis.set_minor_formatter(NullFormatter())
         panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         panel.set_ylabel(f"{panel.get_ylabel()}, logarithmic", fontsize=FONT)
-        return
-    panel.yaxis.set_major_formatter(ScalarFormatter())
 
 
 def fitness_section(run: RunFolder) -> Section | None:

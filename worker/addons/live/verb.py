@@ -142,17 +142,15 @@ def _worker_pictures(args: argparse.Namespace, client: Client) -> Iterator[Itera
 
     with LiveView(client, args.run_name, args.worker) as view:
         spec = view.status.settings.task
-        glass = LiveCanvas(view.run, task=spec.task)
+        canvas = LiveCanvas(view.run, task=spec.task)
         if spec.bundle:
             bundle = fetch_bundle_now(client.session, view.run, spec.bundle)
-            fitting = bundle.with_options(spec.controller, spec.options)
-            manifest, dreamer = bundle.manifest, LiveDreamer(fitting, args.temperature)
-            glass = LiveCanvas(view.run, dreamer=dreamer, task=manifest.task)
-            if spec.task in (DREAM, manifest.task):  # actions of another task are not the world model's
-                names, actions = manifest.facts.action_names, fitting.driving.controls
-                glass = LiveCanvas(view.run, names, dreamer, actions, manifest.task)
+            fitting, task = bundle.with_options(spec.controller, spec.options), bundle.manifest.task
+            own = spec.task in (DREAM, task)  # actions of another task are not the world model's
+            names, actions = (bundle.manifest.facts.action_names, fitting.driving.controls) if own else ((), None)
+            canvas = LiveCanvas(view.run, names, LiveDreamer(fitting, args.temperature), actions, task)
         print(f"watching run {view.run}; its workers: {view.status.workers.present}", file=sys.stderr)
-        yield worker_frames(view, glass, args.fps)
+        yield worker_frames(view, canvas, args.fps)
         if view.is_over:
             print(f"run {view.run} {view.status.state}: {one_line(view.status.why)}", file=sys.stderr)
 
