@@ -26,7 +26,7 @@ def test_the_names_match_the_presets_of_each_side_and_an_error_names_the_other_k
     for find, name, kind in (
         (partial(check_preset, "run"), "attentive", "training"),
         (presets.find_preset, "dream", "run"),
-        (baselines.find_preset, "tiny", "training"),
+        (partial(check_preset, "baseline"), "tiny", "training"),
     ):
         with pytest.raises(UsageError, match=kind):
             find(name)
