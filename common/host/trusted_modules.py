@@ -96,20 +96,25 @@ def find_attribute(module: ModuleType, name: str) -> Any:
     return found
 
 
-def module_folder(module: str) -> Path | None:
-    """The folder to search for a module that this process finds; `None` for an unknown or installed one."""
+def module_places(module: str) -> tuple[Path, ...]:
+    """The file of the top module of this name, or each folder of the package; empty for an unknown or installed one."""
     top = module.partition(".")[0]
     found = sys.modules.get(top)
     try:
         spec = found.__spec__ if found is not None else find_spec(top)  # of a top module nothing is imported
     except (ImportError, ValueError):
-        return None
-    places = list(getattr(spec, "submodule_search_locations", None) or ())  # of a package
-    file = places[0] if places else getattr(spec, "origin", None) or getattr(found, "__file__", None)
-    if file in (None, "built-in", "frozen"):
-        return None
-    folder = Path(file).resolve().parent
-    return None if folder.name in INSTALLED else folder
+        return ()
+    file = getattr(spec, "origin", None) or getattr(found, "__file__", None)
+    places = list(getattr(spec, "submodule_search_locations", None) or ()) or [file]  # folders only of a package
+    if places[0] in (None, "built-in", "frozen") or Path(places[0]).resolve().parent.name in INSTALLED:
+        return ()
+    return tuple(map(Path, places))
+
+
+def module_folder(module: str) -> Path | None:
+    """The folder to search for a module that this process finds; `None` for an unknown or installed one."""
+    places = module_places(module)
+    return places[0].resolve().parent if places else None
 
 
 def search_in(folder: str) -> None:

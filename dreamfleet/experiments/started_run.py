@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Self, Unpack
 from weakref import finalize
 
+from dreamfleet.common.addons.own_modules import trust_own_run
 from dreamfleet.common.addons.status_card import show_live
 from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.cli.parser import Parser
@@ -26,7 +27,6 @@ from dreamfleet.common.printable import suggest
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.common.protocol.tasks import check_task_trusted
-from dreamfleet.common.runs.own_runs import trust_own_run
 from dreamfleet.common.runs.records import StoredGeneration
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import default_runs_dir

@@ -10,12 +10,12 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.addons.own_modules import trust_own_run
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.trained_agent import TrainedAgent
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.common.runs.own_runs import trust_own_run
 from dreamfleet.worker.addons.evaluation.known_score import KnownScore, find_known_score
 from dreamfleet.worker.scoring.scorer import find_checked_world
 from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, Assignment, Policy, Task, World

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.addons.own_modules import trust_own_run
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.host.fingerprint import fingerprint
@@ -22,7 +23,6 @@ from dreamfleet.common.protocol.failures import Failure
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC, class_from_fingerprint
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import check_task_trusted
-from dreamfleet.common.runs.own_runs import trust_own_run
 from dreamfleet.common.runs.records import StoredFailure, StoredResult
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import Stage
