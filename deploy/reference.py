@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 from dreamfleet.common.addons.router.verb import RouterConfig
 from dreamfleet.common.cli.command_line import GROUP, build_parser, load_verb
 from dreamfleet.common.cli.global_config import GlobalConfig
-from dreamfleet.coordinator.addons.bridge.config import BridgeConfig
+from dreamfleet.coordinator.addons.bridge.verb import BridgeConfig
 from dreamfleet.coordinator.addons.dashboard.config import DashboardConfig
 from dreamfleet.coordinator.addons.spawn.config import SpawnConfig
 from dreamfleet.coordinator.settings import run_setup

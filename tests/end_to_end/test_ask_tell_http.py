@@ -1,7 +1,7 @@
 """Batches over HTTP: the bridge's answers to good and bad requests, and to connections that stop.
 
 Tests coordinator/addons/bridge/app.py, coordinator/addons/bridge/changes.py,
-coordinator/addons/bridge/config.py, coordinator/addons/bridge/openapi.py,
+coordinator/addons/bridge/openapi.py
 and coordinator/addons/bridge/verb.py.
 """
 

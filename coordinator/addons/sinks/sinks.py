@@ -1,6 +1,6 @@
 """Records of a run's curves in other programs: the contract, and TensorBoard's."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Protocol
@@ -8,11 +8,10 @@ from typing import Protocol
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import reporting_write_errors
 from dreamfleet.common.files.regular_files import is_file
-from dreamfleet.common.files.tensorboard import EXTRA, open_event_file
+from dreamfleet.common.files.tensorboard import EVENTS, EXTRA, open_event_file
 from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.trusted_modules import find_attribute, import_trusted
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.coordinator.addons.sinks.event_files import read_scalars
 from dreamfleet.coordinator.settings.live_log import SinkName, parse_sink
 
 OWNER = "run_uid"  # a file beside TensorBoard's, with the identity of the run that writes there
@@ -98,3 +97,30 @@ class TensorBoardSink:
     def close(self) -> None:
         """Close the file."""
         self._stack.close()
+
+
+def read_scalars(folder: Path) -> dict[str, dict[int, float]]:
+    """The values of each scalar by its steps, from all event files in `folder`, as TensorBoard shows them.
+
+    A last record that a killed process left incomplete is skipped.
+    """
+    from tensorboardX.proto.event_pb2 import Event, SessionLog
+
+    found: dict[str, dict[int, float]] = {}
+    for path in sorted(folder.glob(EVENTS)):
+        for record in _records(path.read_bytes()):
+            event = Event.FromString(record)
+            if event.session_log.status == SessionLog.START:
+                found = {name: {at: each for at, each in one.items() if at < event.step} for name, one in found.items()}
+            for value in event.summary.value:
+                if value.HasField("simple_value"):
+                    found.setdefault(value.tag, {})[event.step] = value.simple_value
+    return found
+
+
+def _records(data: bytes) -> Iterator[bytes]:
+    """The whole records of TensorFlow's format: a length, its checksum, the bytes, their checksum."""
+    start = 0
+    while (end := start + 16 + int.from_bytes(data[start : start + 8], "little")) <= len(data):
+        yield data[start + 12 : end - 4]
+        start = end

@@ -1,8 +1,12 @@
 """The agent on a remote host: inspects it, installs and starts workers, shows their logs and ends them.
 
-This file is sent over ssh and run by the Python found there, so it imports the standard library only. A request is a
-line of JSON on stdin, followed by the files that it names. An answer is lines on stdout that begin with `MARK`: `say`
-or `line` as it works, then `ok` or `failed`. A lock keeps two commands from changing a host at the same time.
+This file is sent over ssh and run by the Python found there: so it is one, imports the standard library only, and has
+locks and private files of its own. In reading order: `Channel` takes requests and sends answers, `HostFolder` keeps
+what is ours apart from what is not, `WorkerProcess` knows one worker, and each of the `ACTIONS` is a function.
+
+A request is a line of JSON on stdin, followed by the files that it names. An answer is lines on stdout that begin with
+`MARK`: `say` or `line` as it works, then `ok` or `failed`. A lock keeps two commands from changing a host at the same
+time.
 """
 
 import errno

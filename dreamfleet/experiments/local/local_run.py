@@ -224,16 +224,19 @@ def parse_run_flags(flags: Sequence[str], sources: Mapping[str, Any], verb: str)
         raise UsageError(f"--run-flags: {error}") from error
     if taken := [flag for name, flag in RESERVED.items() if getattr(parsed, name, None) is not None]:
         raise UsageError(f"{', '.join(taken)} in --run-flags: {verb} sets them for each run; give --config to {verb}")
-    config, limits = load_parsed_flags(parsed, sources)
-    if limits == LimitsConfig():
-        raise UsageError("a run would never end: give --run-flags a limit, such as --generations 32")
-    return config, limits
+    return load_parsed_flags(parsed, sources)
 
 
 def load_parsed_flags(parsed: argparse.Namespace, sources: Mapping[str, Any]) -> tuple[RunConfig, LimitsConfig]:
-    """What a run is and when it ends, by parsed flags of `coordinator` and the `sources` of another verb."""
+    """What a run is and when it ends, by parsed flags of `coordinator` and the `sources` of another verb.
+
+    `UsageError` where none sets a limit.
+    """
     args = argparse.Namespace(sources={**sources, "flags": parsed}, given=frozenset(vars(parsed)))
-    return run_setup.load_run_config(args, base={})
+    config, limits = run_setup.load_run_config(args, base={})
+    if limits == LimitsConfig():
+        raise UsageError("a run would never end: give its flags a limit, such as --generations 32")
+    return config, limits
 
 
 def free_port() -> int:

@@ -139,10 +139,8 @@ def check_runs(sweep: Sweep, sources: Mapping[str, Any]) -> tuple[str, ...]:
     for run in sweep.runs:
         try:
             parsed = parser.parse_all([*sweep.flags, *run.flags])
-            config, limits = load_parsed_flags(parsed, sources)
+            config, _ = load_parsed_flags(parsed, sources)
             load(NetworkConfig, "network", **{**sources, "flags": parsed})
-            if limits == LimitsConfig():
-                raise UsageError("it would never end: give a limit, such as --generations 32")
             if run.setting not in checked:
                 checked.add(run.setting)
                 tasks |= dict.fromkeys(_check_settings(config, has_start=getattr(parsed, "init", None) is not None))

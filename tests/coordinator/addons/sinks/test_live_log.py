@@ -1,5 +1,5 @@
 """A run's curves in the records of other programs, as its journal has them.
-Tests event_files.py, sinks.py, coordinator/settings/live_log.py and common/files/tensorboard.py."""
+Tests sinks.py, coordinator/settings/live_log.py and common/files/tensorboard.py."""
 
 import json
 import sys
@@ -14,9 +14,8 @@ from dreamfleet.common.files.tensorboard import EVENTS
 from dreamfleet.common.host.packages import hidden
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.addons.runs.export import scalars_of
-from dreamfleet.coordinator.addons.sinks.event_files import read_scalars
 from dreamfleet.coordinator.addons.sinks.live_log import follow, live_log
-from dreamfleet.coordinator.addons.sinks.sinks import check_sinks
+from dreamfleet.coordinator.addons.sinks.sinks import check_sinks, read_scalars
 from dreamfleet.coordinator.settings.live_log import SinkName, parse_sink
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from tests.support.events import scalars
