@@ -102,16 +102,15 @@ class _Handlers:
     async def _events(self, run: str | None) -> AsyncIterator[bytes]:
         """A frame for each snapshot, and the curves whenever they changed."""
         yield event("hello", {"digest": self._files.digest, "views": self._views.is_enabled})
-        curves_version = None
+        curves = b""
         async for snapshot in self._feed.snapshots():
             shown = snapshot.find(run)
             if shown is None:
                 yield snapshot.absent_event
                 continue
             yield shown.page_state
-            if shown.curves_version != curves_version:
-                curves_version = shown.curves_version
-                yield shown.curves
+            if shown.curves != curves:
+                yield (curves := shown.curves)
 
 
 def _stream(request: Request, events: AsyncIterator[bytes]) -> Response:

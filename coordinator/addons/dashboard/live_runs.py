@@ -42,7 +42,6 @@ class RunEvents:
 
     page_state: bytes
     curves: bytes
-    curves_version: tuple[str, int]  # the run's uid and a counter; differs when the curves changed
 
 
 @dataclass(frozen=True)
@@ -122,8 +121,8 @@ class Watcher:
                 former = self._followed.pop(name, None)  # reinsert it as the newest
                 followed = self._followed[name] = _FollowedRun(status, self._runs_dir)
                 followed.lanes = self._past_lanes.pop(followed.uid, followed.lanes)
-                if former is not None and former.uid == followed.uid:  # its curves may be others than viewers have
-                    followed.lanes, followed.drawings = former.lanes, former.drawings
+                if former is not None and former.uid == followed.uid:
+                    followed.lanes = former.lanes
             followed.update(status, self._client, now)
         except UNREADABLE as error:
             self._problem = f"run {name}: {error}"
@@ -178,7 +177,6 @@ class _FollowedRun:
     _quartiles: dict[int, tuple[float, float]] | None = None  # `None`: no journal of it here
     _archive: RunArchive | None = None  # of a run with one, whose journal is on this disk
     _archived: int = 0  # generations whose candidates are in it
-    drawings: int = 0  # how often the curves were rendered
     _rendered_curves: tuple[Any, bytes] = (None, b"")  # cache key, event
 
     def __post_init__(self) -> None:
@@ -238,7 +236,7 @@ class _FollowedRun:
         )  # fmt: skip
         self._render_curves()
         frame = event("frame", {**page_state(snapshot), "live": live})
-        return RunEvents(frame, self._rendered_curves[1], (self.uid, self.drawings))
+        return RunEvents(frame, self._rendered_curves[1])
 
     def _fetch_missing_rows(self, status: Status, client: Client) -> None:
         self._append_recent(status)
@@ -279,7 +277,7 @@ class _FollowedRun:
         except DreamfleetError:  # it was moved away
             self._quartiles = self._archive = None
         drawn = {**curves(data, self._quartiles, word=self._word), "archive": describe_archive(self._archive)}
-        self._rendered_curves, self.drawings = (of, event("curves", drawn)), self.drawings + 1
+        self._rendered_curves = of, event("curves", drawn)
 
     def _read_journal(self, stored: RunFolder) -> None:
         """Read the missing quartiles of drawn generations, and the candidates of newly closed ones."""
