@@ -5,6 +5,9 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
+from dreamfleet.common.cli.command_line import GROUP, build_parser, load_verb
+from dreamfleet.common.errors import DreamfleetError
+
 SUMMARY = "print a script that completes verbs and flags in bash, zsh or fish"
 EXTRAS = ("completion",)
 PLACES = {
@@ -26,17 +29,12 @@ def run(args: argparse.Namespace) -> int:
     """Print the script; it needs no dreamfleet while it completes, so write it again after an update."""
     import shtab
 
-    print(shtab.complete(_whole_parser(), args.shell))
+    print(shtab.complete(_whole_parser(shtab.FILE), args.shell))
     return 0
 
 
-def _whole_parser() -> argparse.ArgumentParser:
+def _whole_parser(completed_by_files: object) -> argparse.ArgumentParser:
     """A parser of all verbs and their flags; one that cannot be loaded is left out."""
-    import shtab
-
-    from dreamfleet.common.cli.command_line import GROUP, build_parser, load_verb
-    from dreamfleet.common.errors import DreamfleetError
-
     root = argparse.ArgumentParser(prog="dreamfleet")
     verbs: dict[str, Any] = {"": root.add_subparsers()}
     for point in sorted(entry_points(group=GROUP), key=lambda each: each.name):
@@ -50,6 +48,6 @@ def _whole_parser() -> argparse.ArgumentParser:
         added = verbs[group].add_parser(name, help=parser.description, add_help=False)
         for action in parser._actions:
             if action.type is Path:
-                action.complete = shtab.FILE  # type: ignore[attr-defined]
+                action.complete = completed_by_files  # type: ignore[attr-defined]
             added._add_action(action)
     return root

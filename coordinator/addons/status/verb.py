@@ -48,7 +48,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the status; if several runs are live and none is named, one line per run."""
     if args.watch:
-        return _watch(resolve_network(args), args.run_name, as_json=args.json)
+        _watch(resolve_network(args), args.run_name, as_json=args.json)
+        return 0
     with naming_the_stored_run(args.runs_dir, args.run_name), Client(resolve_network(args)) as client:
         documents = [client.document(args.run_name)] if args.run_name or args.json else client.statuses()
         if args.json:
@@ -56,18 +57,9 @@ def run(args: argparse.Namespace) -> int:
         elif len(documents) > 1:
             print_runs(documents)
         else:
-            from rich.console import Console
-
-            from dreamfleet.common.client.status import read_status
-
             status = read_status(documents[0] if documents else client.document())
             Console().print(_PanelBuilder(client).build(status))
     return 0
-
-
-def _can_redraw() -> bool:
-    """Whether the terminal can redraw; a dumb one would show nothing until the end."""
-    return sys.stdout.isatty() and not Console().is_dumb_terminal
 
 
 def print_runs(documents: Sequence[dict[str, Any]]) -> None:
@@ -94,11 +86,12 @@ def print_runs(documents: Sequence[dict[str, Any]]) -> None:
     print(f"{plural(len(rows), 'live run')}; `dreamfleet status RUN` shows more", file=sys.stderr)
 
 
-def _watch(network: Network, name: str | None, *, as_json: bool) -> int:
+def _watch(network: Network, name: str | None, *, as_json: bool) -> None:
     """Show the status until the coordinator leaves; wait while it does not answer."""
-    show = _print_json_lines if as_json else _show_live if _can_redraw() else _print_changes
+    can_redraw = sys.stdout.isatty() and not Console().is_dumb_terminal  # which would show nothing until the end
+    show = _print_json_lines if as_json else _show_live if can_redraw else _print_changes
     with _retry_until_answered(lambda: Client(network)) as client:
-        return show(client, name or str(_retry_until_answered(client.document)["run"]))
+        show(client, name or str(_retry_until_answered(client.document)["run"]))
 
 
 def _retry_until_answered(ask: Callable[[], T]) -> T:
@@ -124,21 +117,19 @@ def _follow_documents(client: Client, name: str) -> Iterator[dict[str, Any]]:
             return
 
 
-def _print_json_lines(client: Client, name: str) -> int:
+def _print_json_lines(client: Client, name: str) -> None:
     for document in _follow_documents(client, name):
         print(json.dumps(document), flush=True)
-    return 0
 
 
-def _show_live(client: Client, name: str) -> int:
+def _show_live(client: Client, name: str) -> None:
     panels = _PanelBuilder(client, fitted=True)
     with Live(refresh_per_second=4, vertical_overflow="crop") as live:
         for document in _follow_documents(client, name):
             live.update(panels.build(read_status(document)), refresh=True)
-    return 0
 
 
-def _print_changes(client: Client, name: str) -> int:
+def _print_changes(client: Client, name: str) -> None:
     """Print a line whenever generation, evaluations, state or workers change; at the end the panel."""
     shown = None
     for status in map(read_status, _follow_documents(client, name)):
@@ -147,7 +138,6 @@ def _print_changes(client: Client, name: str) -> int:
             print(one_line(f"{status.run}: {LiveRunView.of_status(status).summary}"), flush=True)
         shown = now
     Console().print(_PanelBuilder(client).build(status))
-    return 0
 
 
 class _PanelBuilder:
