@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
+from operator import attrgetter
 from typing import Any, ClassVar
 
 import numba
@@ -44,10 +45,13 @@ with _without_compiling(), hidden("torch"):  # which the library only checks typ
 
 CANDIDATES = 16  # of an emitter, as CMA-ES' default for a few dozen parameters
 LARGEST_ARCHIVE = 5 * 10**8  # bytes of its elites' parameters
-_ARRAYS = ("mean", "pc", "ps")  # of an emitter's evolution strategy
-_SCALARS = ("current_eval", "sigma")
-_COVARIANCE = {"diagonal": ("cov",), "full": ("cov", "eigenbasis", "eigenvalues", "invsqrt")}
-_COVARIANCE_SCALARS = {"diagonal": (), "full": ("condition_number", "updated_eval")}
+# Of an emitter's evolution strategy, by the kind of its covariance matrix.
+_DIAGONAL = ("mean", "pc", "ps", "cov.cov")
+_ARRAYS = {"diagonal": _DIAGONAL, "full": (*_DIAGONAL, "cov.eigenbasis", "cov.eigenvalues", "cov.invsqrt")}
+_SCALARS = {
+    "diagonal": ("current_eval", "sigma"),
+    "full": ("current_eval", "sigma", "cov.condition_number", "cov.updated_eval"),
+}
 
 
 class RibsOptimiser(ABC):
@@ -231,10 +235,8 @@ class CmaMe(RibsOptimiser):
 
     def _emitter_state(self, emitter: Any) -> State:
         strategy = emitter._opt
-        arrays: State = {name: getattr(strategy, name).copy() for name in _ARRAYS}
-        arrays |= {f"cov.{name}": getattr(strategy.cov, name).copy() for name in _COVARIANCE[self._covariance]}
-        scalars = {name: tag(getattr(strategy, name)) for name in _SCALARS}
-        scalars |= {f"cov.{name}": tag(getattr(strategy.cov, name)) for name in _COVARIANCE_SCALARS[self._covariance]}
+        arrays: State = {name: attrgetter(name)(strategy).copy() for name in _ARRAYS[self._covariance]}
+        scalars = {name: tag(attrgetter(name)(strategy)) for name in _SCALARS[self._covariance]}
         scalars |= {"restarts": tag(emitter._restarts), "itrs": tag(emitter._itrs)}
         arrays["scalars"] = np.array(json.dumps(scalars, sort_keys=True))
         arrays["random"] = _random_state(strategy._rng)
@@ -242,14 +244,10 @@ class CmaMe(RibsOptimiser):
 
     def _restore_emitter(self, emitter: Any, state: Mapping[str, NDArray[Any]]) -> None:
         strategy, scalars = emitter._opt, json.loads(str(state["scalars"]))
-        for name in _ARRAYS:
-            setattr(strategy, name, state[name].copy())
-        for name in _COVARIANCE[self._covariance]:
-            setattr(strategy.cov, name, state[f"cov.{name}"].copy())
-        for name in _SCALARS:
-            setattr(strategy, name, untag(scalars[name]))
-        for name in _COVARIANCE_SCALARS[self._covariance]:
-            setattr(strategy.cov, name, untag(scalars[f"cov.{name}"]))
+        found = {name: state[name].copy() for name in _ARRAYS[self._covariance]}
+        found |= {name: untag(scalars[name]) for name in _SCALARS[self._covariance]}
+        for name, value in found.items():
+            setattr(strategy.cov if name.startswith("cov.") else strategy, name.removeprefix("cov."), value)
         emitter._restarts, emitter._itrs = untag(scalars["restarts"]), untag(scalars["itrs"])
         _set_random_state(strategy._rng, state["random"])
 
