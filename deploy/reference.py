@@ -87,8 +87,6 @@ UNITS = {
 RUN_ARGUMENTS = Path(__file__).parents[1] / "dreamfleet" / "experiments" / "local" / "run_arguments.py"
 RUN_ARGUMENTS_HEAD = '''"""Settings of `start_run` and `evolve`. Written by `make reference`: change the flags."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypedDict

@@ -36,7 +36,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     which.add_argument("--worker", metavar="W", help="of this worker, or of all worker processes of this host's worker")
     which.add_argument("--job", metavar="G/I", help="of this candidate's jobs: generation/index, such as 3/0")
     parser.add_argument(
-        "--what", nargs="+", metavar="WORD", default=(), choices=get_args(EventKind),
+        "--what", nargs="+", metavar="WORD", default=(),
         help="only events of these kinds, such as: joined back silent lost left reissued",
     )  # fmt: skip
     text = f"so many events at most (default {LAST} of a live run; all of a journal, or with --json)"
@@ -69,6 +69,8 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(f"--worker {args.worker!r}: give a name as `dreamfleet status` shows it")
     if args.last is not None and args.last < 1:
         raise UsageError("--last must be at least 1")
+    if strange := [each for each in args.what if each not in (words := get_args(EventKind))]:
+        raise UsageError(f"--what {strange[0]!r}: there are {', '.join(words)}")
 
 
 def _print_live(args: argparse.Namespace) -> int:

@@ -62,6 +62,11 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _can_redraw() -> bool:
+    """Whether the terminal can redraw; a dumb one would show nothing until the end."""
+    return sys.stdout.isatty() and not Console().is_dumb_terminal
+
+
 def print_runs(documents: Sequence[dict[str, Any]]) -> None:
     """One line per run; an unreadable status is a note."""
     views = []
@@ -88,8 +93,7 @@ def print_runs(documents: Sequence[dict[str, Any]]) -> None:
 
 def _watch(network: Network, name: str | None, *, as_json: bool) -> None:
     """Show the status until the coordinator leaves; wait while it does not answer."""
-    can_redraw = sys.stdout.isatty() and not Console().is_dumb_terminal  # which would show nothing until the end
-    show = _print_json_lines if as_json else _show_live if can_redraw else _print_changes
+    show = _print_json_lines if as_json else _show_live if _can_redraw() else _print_changes
     with _retry_until_answered(lambda: Client(network)) as client:
         show(client, name or str(_retry_until_answered(client.document)["run"]))
 
