@@ -30,7 +30,7 @@ MOST_VERBS, MOST_FLAGS = 54, 184  # of the command line; other settings are keys
 NAMING_WORLDS = {
     "common/addons/worlds/__init__.py": "lists its modules",
     "common/artifacts/__init__.py": "lists car_racing_variants",
-    "common/artifacts/driving.py": "the one default: files that name no world are CarRacing's, and have its variants",
+    "common/artifacts/driving.py": "the one default, and its variants",
     "common/host/packages.py": "packages and extras, as pyproject.toml names them",
     "worker/addons/health.py": "doctor asks it where gymnasium may be absent, which CarRacing's room imports",
     "worker/dream/__init__.py": "an environment's former name, which notebooks and agents of others use",

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import MAX_OUTPUTS
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape, import_hint
-from dreamfleet.common.artifacts.driving import Driving, Variant, facts_left_out, parse_driving
+from dreamfleet.common.artifacts.driving import Driving, Variant, parse_driving
 from dreamfleet.common.artifacts.onnx_checks import find_fault, read_float_array
 from dreamfleet.common.artifacts.world_facts import WorldFacts
 from dreamfleet.common.errors import BundleError, ControllerError, UsageError
@@ -51,7 +51,7 @@ MAX_RECORDED_STATES = 16_384  # states; 19 MB with the default layers
 
 @dataclass(frozen=True)
 class BundleManifest:
-    """A bundle's manifest: its shapes, task and preprocessing, the hash of each part, and its provenance."""
+    """A bundle's manifest: its shapes, task and preprocessing, its world, the hash of each part, and its provenance."""
 
     name: Word
     task: Word
@@ -60,17 +60,12 @@ class BundleManifest:
     latent: Annotated[int, Meta(ge=1, le=10_000)]
     hidden: Annotated[int, Meta(ge=1, le=100_000)]
     actions: Annotated[int, Meta(ge=1, le=MAX_OUTPUTS)]
+    world: WorldFacts
     parts: dict[str, Any] = field(default_factory=dict)  # name -> SHA-256; `write_bundle` fills it in
     provenance: dict[str, Any] = field(default_factory=dict)
     format: int = FORMAT
     # The configurations of `vae` and `mdnrnn`; empty in older bundles, which have the paper's.
     models: dict[str, Any] = field(default_factory=dict, metadata=OPTIONAL)
-    world: WorldFacts | None = field(default=None, metadata=OPTIONAL)  # CarRacing's bundles leave it out; read `facts`
-
-    @property
-    def facts(self) -> WorldFacts:
-        """The facts of its world; `MalformedError` if they are left out, and the world is not CarRacing."""
-        return self.world or facts_left_out(self.task, self.models.get("mdnrnn", {}).get("reward"))
 
 
 class Bundle(Displayed):
@@ -81,7 +76,7 @@ class Bundle(Displayed):
     >>> bundle.manifest.latent, bundle.manifest.hidden, bundle.controller_shape.size
     (32, 256, 867)
     >>> bundle
-    <Bundle tiny of car-racing: latent 32, hidden 256, SHA-256 c593fb1347bd>
+    <Bundle tiny of car-racing: latent 32, hidden 256, SHA-256 2c7f1b10019c>
     """
 
     def __init__(
@@ -167,7 +162,7 @@ class Bundle(Displayed):
 
     def driving_of(self, options: str) -> Driving:
         """How controllers drive under a run's options, JSON or empty; `UsageError` for options that do not exist."""
-        return parse_driving(self.manifest.task, self.manifest.facts, options)
+        return parse_driving(self.manifest.task, self.manifest.world, options)
 
     def shape_of(self, features: str, hidden: int = 0, driving: Driving | None = None) -> ControllerShape:
         """The shape of controllers on `features`, with `hidden` units between (0: linear).
@@ -334,7 +329,7 @@ def _read_manifest(archive: Archive, path: Path) -> BundleManifest:
                 raise MalformedError(f"{name} is not a finite number")
         if not all(map(str.isprintable, (manifest.name, manifest.task, manifest.preprocessing))):
             raise MalformedError("a name holds control characters")
-        if manifest.facts.actions.actions != manifest.actions:
+        if manifest.world.actions.actions != manifest.actions:
             raise MalformedError("its world has another number of actions")
     except DamagedArchiveError:
         raise

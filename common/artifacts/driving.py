@@ -2,28 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
 
-from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, FACTS, Variant
+from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, Variant
 from dreamfleet.common.artifacts.task_options import read_options
 from dreamfleet.common.artifacts.world_driving import Driving, WorldDriving
-from dreamfleet.common.artifacts.world_facts import RewardFacts, WorldFacts
-from dreamfleet.common.schema.validation import MalformedError
+from dreamfleet.common.artifacts.world_facts import WorldFacts
 
-__all__ = ["FIRST_WORLD", "Driving", "Variant", "WorldDriving", "facts_left_out", "parse_driving"]
+__all__ = ["FIRST_WORLD", "Driving", "Variant", "WorldDriving", "parse_driving"]
 
-FIRST_WORLD = CAR_RACING  # the task of files that name none, and the default
-
-
-def facts_left_out(task: str, predicted: object) -> WorldFacts:
-    """The facts of CarRacing, whose manifests leave them out; `MalformedError` for another task.
-
-    Its dreams pay what the model has `predicted` if that is the value, or else by the label of a reward.
-    """
-    if task != CAR_RACING:
-        raise MalformedError(f"it does not describe the world of {task}")
-    return replace(FACTS, reward=RewardFacts()) if predicted == "value" else FACTS
+FIRST_WORLD = CAR_RACING  # the default
 
 
 def parse_driving(task: str, facts: WorldFacts, options: str) -> Driving:

@@ -34,5 +34,5 @@ def score_word_of_run(spec: TaskSpec, bundle: Path) -> str:
     """What a scored seed of a run's evaluations is called; `bundle` is the run's copy of its world model, if any."""
     if spec.bundle:
         with suppress(DreamfleetError, OSError):  # it may be gone
-            return Bundle.open(bundle, spec.bundle).manifest.facts.score_word
+            return Bundle.open(bundle, spec.bundle).manifest.world.score_word
     return score_word(spec.task)

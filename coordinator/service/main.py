@@ -168,7 +168,7 @@ def _serve_incarnation(request: RunRequest, stop: Stop, kept: _Kept) -> Run:
             run = Run(journal, settings, request.limits, request.network, monotonic(), host_key)
             return OpenRun(run, file_watch, served)
 
-        word = score_word(settings.task.task) if bundle is None else bundle.manifest.facts.score_word
+        word = score_word(settings.task.task) if bundle is None else bundle.manifest.world.score_word
         own, intervals = request.network, Intervals(request.network.beat, request.network.beat)
         network = Network(own.listen, own.connect, request.credentials, revocations.revoked_seats)
         service = Service(request.name, network, intervals, own.metrics_port, revocations, word)
@@ -259,4 +259,4 @@ def _episode_limit(config: RunConfig, bundle: Bundle | None) -> int:
     """Steps after which a scored episode's environment ends it; 0 if it has no limit, none is known, or it dreams."""
     if bundle is None:
         return config.description.steps if config.description else 0
-    return bundle.manifest.facts.horizon if config.task in (None, bundle.manifest.task) else 0
+    return bundle.manifest.world.horizon if config.task in (None, bundle.manifest.task) else 0

@@ -73,7 +73,7 @@ def _fill_in(config: RunConfig, bundle: Bundle | None) -> RunConfig:
     if config.task is not None and is_function_task(config.task):
         return replace(config, horizon=1)
     if config.horizon is None:
-        limit = DEFAULT_HORIZON if bundle is None else bundle.manifest.facts.horizon
+        limit = DEFAULT_HORIZON if bundle is None else bundle.manifest.world.horizon
         return replace(config, horizon=min(limit, DEFAULT_HORIZON))
     return config
 
@@ -102,7 +102,7 @@ def _with_bundle(config: RunConfig, bundle: Bundle) -> Scored:
         )
     if config.recorded:
         bundle.check_recorded()
-    driving, facts = _driving(config, bundle), bundle.manifest.facts
+    driving, facts = _driving(config, bundle), bundle.manifest.world
     shape = bundle.with_controllers(
         bundle.shape_of(config.features, _hidden(config), driving), driving
     ).controller_shape

@@ -58,7 +58,7 @@ def test_the_drives_are_a_function_of_the_run_and_not_of_the_worker(processes, s
         scored = {each.seed for g in range(GENERATIONS) for i in range(4) for each in run.results(g, i)}
         assert not scored & {each.seed for each in results}
     with np.load(io.BytesIO(seen[0][expected()[0]])) as drive:
-        assert set(drive) == {"picture", "action", "reward", "ended", "driver", "preprocessing"}
+        assert set(drive) == {"picture", "action", "reward", "ended", "driver", "preprocessing", "world"}
         assert str(drive["driver"]) == "controller"
         assert len(drive["action"]) == len(drive["reward"]) == len(drive["picture"]) == 10
         with open_run(processes.runs, "one") as run:

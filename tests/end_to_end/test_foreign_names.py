@@ -60,7 +60,7 @@ def folder(tmp_path, monkeypatch, mark):
     small = Bundle.open(FIXTURES / "small.zip")
     parts = {name: small.read(name) for name in small.manifest.parts}
     for name, task in (("own", OWN), ("gym", GYM)):
-        manifest = replace(small.manifest, task=task, world=small.manifest.facts)
+        manifest = replace(small.manifest, task=task)
         bundle = write_bundle(tmp_path / f"{name}-bundle.zip", manifest, parts)
         write_controller(tmp_path / f"{name}.npz", task)
         write_controller(tmp_path / f"{name}-seen" / "controller.npz", "car-racing", bundle)

@@ -21,7 +21,9 @@ from dreamfleet.common.artifacts.bundle import (
     write_bundle,
 )
 from dreamfleet.common.schema.validation import to_plain
+from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD
 from dreamfleet.worker.training.data.dataset import find_world, preprocessing_of_size
+from dreamfleet.worker.training.dream_facts import NO_DRIVES, describe_world
 from dreamfleet.worker.worldmodel.export import (
     export_controller,
     export_decoder,
@@ -133,8 +135,8 @@ def write_random_bundle(path, seed=0, vae=PAPER, rnn=REWARDED, initial=None, rec
         LINEAR_CONTROLLER: export_controller(actions, hidden=False),
         LAYERED_CONTROLLER: export_controller(actions, hidden=True),
     }
-    preprocessing = preprocessing_of_size(vae.picture).name
-    return _write(path, "car-racing", preprocessing, seed, vae, rnn, weights, initial, recorded, more)
+    pictures, facts = preprocessing_of_size(vae.picture).name, describe_world(OF_FIRST_WORLD, NO_DRIVES, rnn)
+    return _write(path, "car-racing", pictures, seed, vae, rnn, weights, initial, recorded, facts, more)
 
 
 def write_world_bundle(
@@ -144,10 +146,10 @@ def write_world_bundle(
     """A bundle of a world that its manifest describes by `facts`; its MDN-RNN takes the world's actions."""
     rnn = replace(rnn, actions=facts.actions.actions)
     weights = random_vae_weights(seed, vae), random_rnn_weights(seed, rnn)
-    return _write(path, task, preprocessing, seed, vae, rnn, weights, None, recorded, facts=facts)
+    return _write(path, task, preprocessing, seed, vae, rnn, weights, None, recorded, facts)
 
 
-def _write(path, task, preprocessing, seed, vae, rnn, weights, initial, recorded, more=(), facts=None):
+def _write(path, task, preprocessing, seed, vae, rnn, weights, initial, recorded, facts, more=()):
     if initial is None:
         initial = np.random.default_rng(seed).normal(size=(4, 2, vae.latent)).astype(np.float32)
     parts = {
@@ -157,7 +159,7 @@ def _write(path, task, preprocessing, seed, vae, rnn, weights, initial, recorded
     if recorded is not None:
         parts[RECORDED_STATES] = npy(recorded)
     manifest = BundleManifest(
-        "random", task, preprocessing, (vae.picture, vae.picture, 3), vae.latent, rnn.hidden, rnn.actions,
-        provenance={"seed": seed}, models={"vae": to_plain(vae), "mdnrnn": to_plain(rnn)}, world=facts,
+        "random", task, preprocessing, (vae.picture, vae.picture, 3), vae.latent, rnn.hidden, rnn.actions, facts,
+        provenance={"seed": seed}, models={"vae": to_plain(vae), "mdnrnn": to_plain(rnn)},
     )  # fmt: skip
     return write_bundle(path, manifest, parts)

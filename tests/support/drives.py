@@ -26,9 +26,9 @@ def write_drive(folder, number, steps=12, picture=64, world=OF_FIRST_WORLD, acti
         "ended": np.array(False),
         "driver": np.array("held"),
         "preprocessing": np.array(preprocessing_of_size(picture, world).name),
+        "world": np.array(world.text),
     }
-    named = {} if world == OF_FIRST_WORLD else {"world": np.array(world.text)}
-    np.savez_compressed(path, **arrays | named | more)
+    np.savez_compressed(path, **arrays | more)
     return path
 
 
@@ -49,7 +49,7 @@ def write_encoded(folder, rewards, latent=4, actions=3, *, ended=False):
     for path, reward in zip(paths, np.asarray(rewards, np.float32), strict=True):
         rows = {"mu": latent, "logvar": latent, "action": actions}
         zeros = {name: np.zeros((len(reward), size), np.float32) for name, size in rows.items()}
-        np.savez(path, **zeros, reward=reward, ended=np.array(ended))
+        np.savez(path, **zeros, reward=reward, ended=np.array(ended), world=np.array(OF_FIRST_WORLD.text))
     return paths
 
 
@@ -72,7 +72,7 @@ def write_encoded_drives(folder):
     from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 
     write_drives(folder)
-    (folder / "preset.json").write_text('{"preset": "attentive"}')
+    (folder / "preset.json").write_text('{"preset": "attentive", "task": "car-racing"}')
     config = replace(TINY.vae, updates=2, batch=8, validate_every=1)
     return train_models(folder, config, VAEConfig(latent=4, channels=(2, 2, 2, 2)))
 

@@ -32,7 +32,7 @@ from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.presets import find_preset
 from dreamfleet.worker.dream.batch import DreamBatch
-from dreamfleet.worker.scoring.rollout import write_episode
+from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, write_episode
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.assemble import assemble, export_graphs, make_manifest
@@ -43,6 +43,7 @@ from dreamfleet.worker.training.data.data_folder import store_preset
 from dreamfleet.worker.training.data.dataset import episode_paths
 from dreamfleet.worker.training.data.pilot import Pilot
 from dreamfleet.worker.training.data.rollouts import done_labels, load_rollouts
+from dreamfleet.worker.training.dream_facts import NO_DRIVES, describe_world
 from dreamfleet.worker.training.encode import ENCODED, encode
 from dreamfleet.worker.training.presets import PRESETS, TrainConfig
 from dreamfleet.worker.training.torch_setup import on_one_thread
@@ -127,7 +128,8 @@ def made_bundle(path, vae, rnn):
     models = [{name: made(name, array) for name, array in sorted(each.items())} for each in drawn]
     initial = random.uniform(-1, 1, (4, 2, vae.latent)).astype(np.float32)
     parts = export_graphs(*models, initial, vae, rnn)
-    return write_bundle(path, make_manifest("made", {"seed": 3}, vae, rnn), parts)
+    facts = describe_world(OF_FIRST_WORLD, NO_DRIVES, rnn)
+    return write_bundle(path, make_manifest("made", {"seed": 3}, facts, vae, rnn), parts)
 
 
 def manifest_text(bundle):

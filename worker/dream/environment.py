@@ -77,7 +77,7 @@ class Dream(gymnasium.Env[Floats, Any]):
         self._bundle = open_bundle(bundle)
         self._world = DreamWorld(self._bundle, temperature, recorded=recorded, end=end)
         self.metadata = {**self.metadata, "render_fps": self._world.frames_per_second}
-        self._horizon = horizon or self._bundle.manifest.facts.horizon
+        self._horizon = horizon or self._bundle.manifest.world.horizon
         self.render_mode = render_mode
         self._decoder = Decoder(self._bundle) if render_mode else None
         self._observation = Observation(self._bundle, features)
@@ -128,7 +128,7 @@ class VectorDream(gymnasium.vector.VectorEnv[Floats, Any, Any]):
         self._bundle = open_bundle(bundle)
         self._world = DreamWorld(self._bundle, temperature, recorded=recorded, end=end)
         self.metadata = {**self.metadata, "render_fps": self._world.frames_per_second}
-        self._horizon = horizon or self._bundle.manifest.facts.horizon
+        self._horizon = horizon or self._bundle.manifest.world.horizon
         self.num_envs = num_envs
         self.render_mode = render_mode
         self._decoder = Decoder(self._bundle) if render_mode else None

@@ -32,7 +32,7 @@ class DreamEnds:
 
     def __init__(self, bundle: Bundle, temperature: float, text: str = "") -> None:
         """`text` is a rule in place of the bundle's, as in `EndRule.parse`; empty: the bundle's own."""
-        self.rule = bundle.manifest.facts.end
+        self.rule = bundle.manifest.world.end
         if text:
             self.rule = replace(EndRule.parse(text), odds_weight=self.rule.odds_weight)
         self.bars: Bars | None = None  # for the dreams' noise; thresholds need none
@@ -70,7 +70,7 @@ class DreamWorld:
         model: dict[str, Any] = bundle.manifest.models.get("mdnrnn", {})
         self._reward_kind = str(model.get("reward", "none"))
         self._reward_scale = float(model.get("reward_scale", 1.0))  # of a value: what its labels were divided by
-        facts = bundle.manifest.facts
+        facts = bundle.manifest.world
         self.actions, self.action_names = bundle.driving.controls, facts.action_names
         self.frames_per_second = facts.frames_per_second
         self._reward = _predicted_reward(bundle, self._reward_kind)
@@ -125,7 +125,7 @@ class DreamWorld:
 
 def _predicted_reward(bundle: Bundle, kind: str) -> RewardFacts:
     """The reward of a dreamt step; `BundleError` if it is no survival, and no reward head of `kind` predicts it."""
-    found = bundle.manifest.facts.reward
+    found = bundle.manifest.world.reward
     survives = found.source == "survival"
     if kind == "none" and not survives:
         raise BundleError(f"{bundle.path.name} predicts no reward: its dreams cannot be scored")

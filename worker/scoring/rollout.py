@@ -15,36 +15,36 @@ from dreamfleet.common.artifacts.driving import FIRST_WORLD
 class DataWorld(NamedTuple):
     """The world of data: a task's name, and the options under which it was recorded."""
 
-    task: str = FIRST_WORLD
+    task: str
     options: str = ""  # as the task's `parse_options` writes them
 
     @property
     def text(self) -> str:
-        """The text that stands in a file, where the data are not of the first world."""
+        """The text that stands in a file."""
         return f"{self.task}\n{self.options}"
 
     @classmethod
     def of(cls, bundle: Bundle) -> DataWorld:
         """The world of the data that a bundle was trained on."""
-        return cls(bundle.manifest.task, bundle.manifest.facts.options)
+        return cls(bundle.manifest.task, bundle.manifest.world.options)
 
     @classmethod
     def parse(cls, text: str) -> DataWorld:
-        """The world of a file's text; an empty one is of the first world."""
+        """The world of a file's text."""
         task, _, options = text.partition("\n")
-        return cls(task or FIRST_WORLD, options)
+        return cls(task, options)
 
     def __str__(self) -> str:
         return f"{self.task} with {self.options}" if self.options else self.task
 
 
-OF_FIRST_WORLD = DataWorld()
+OF_FIRST_WORLD = DataWorld(FIRST_WORLD)
 
 
 class Rollout:
     """A recording that grows step by step; equal recordings give equal files."""
 
-    def __init__(self, driver: str, preprocessing: str, world: DataWorld = OF_FIRST_WORLD) -> None:
+    def __init__(self, driver: str, preprocessing: str, world: DataWorld) -> None:
         self.ended = False  # whether the environment ended it
         self.terminal = False  # whether that was a death, and no limit
         self._driver = driver
@@ -69,7 +69,7 @@ class Rollout:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The T steps as arrays: `picture` (T, side, side, 3), `action` (T, actions), `reward` (T,), and metadata.
 
-        `terminal` is there only where it differs from `ended`, and `world` only where it is not the first.
+        `terminal` is there only where it differs from `ended`.
         """
         arrays: dict[str, NDArray[Any]] = {
             "picture": np.stack(self._pictures),
@@ -78,11 +78,10 @@ class Rollout:
             "ended": np.array(self.ended),
             "driver": np.array(self._driver),
             "preprocessing": np.array(self._preprocessing),
+            "world": np.array(self._world.text),
         }
         if self.terminal != self.ended:
             arrays["terminal"] = np.array(self.terminal)
-        if self._world != OF_FIRST_WORLD:
-            arrays["world"] = np.array(self._world.text)
         return arrays
 
     def to_bytes(self) -> bytes:

@@ -22,7 +22,7 @@ from dreamfleet.common.protocol.messages import MAX_SIDE_BY_SIDE, Kind, TaskSpec
 from dreamfleet.common.schema.display import Displayed
 from dreamfleet.worker.scoring.episode import EpisodeConfig, score, score_side_by_side
 from dreamfleet.worker.scoring.host_class_probe import REPEAT_LIMIT, HostClassProbe
-from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld, Rollout
+from dreamfleet.worker.scoring.rollout import DataWorld, Rollout
 from dreamfleet.worker.scoring.watched_policy import WatchedPolicy
 from dreamfleet.worker.tasks.api import Assignment, Score, Task, World
 from dreamfleet.worker.tasks.batches import Batch, BatchedTask, WatchableBatch
@@ -84,7 +84,7 @@ class Scorer(Displayed):
         self._measurer = Measurer(spec.measures, self.world.actions, self.world.action_names, truth)
         bundle = assignment.bundle
         self._preprocessing = "" if bundle is None else bundle.manifest.preprocessing
-        self._data_world = OF_FIRST_WORLD if bundle is None else DataWorld.of(bundle)
+        self._data_world = DataWorld(spec.task, spec.options) if bundle is None else DataWorld.of(bundle)
 
     def _display(self) -> tuple[str, dict[str, object]]:
         spec, size = self.spec, self._assignment.controller.size

@@ -63,7 +63,7 @@ def find_world(name: str, options: str = "") -> RecordableTask:
 def task_of(bundle: Bundle) -> Task:
     """The task that a bundle was trained on, under the options in its manifest; errors as in `find_world`."""
     manifest = bundle.manifest
-    return _bind(find_task(manifest.task), manifest.facts.options)
+    return _bind(find_task(manifest.task), manifest.world.options)
 
 
 def find_scored_task(name: str, bundle: Bundle | None) -> Task:

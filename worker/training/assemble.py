@@ -32,7 +32,7 @@ from dreamfleet.common.artifacts.bundle import (
     write_bundle,
 )
 from dreamfleet.common.artifacts.world_facts import WorldFacts
-from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import read_regular
 from dreamfleet.common.host.packages import package_version
@@ -98,22 +98,18 @@ def assemble(
     """Build the bundle of a data folder with trained models, with at most `recorded` states of its drives.
 
     `measured` are files of `inspect --json` on the same bundle without them; `DatasetError` if on another bundle.
-    `reward` and `end` say how dreams pay and end, as in `describe_world`; CarRacing's bundle says neither.
+    `reward` and `end` say how dreams pay and end, as in `describe_world`.
     """
     measurements = [(path, *_load_measurements(path)) for path in measured]
     vae, rnn, vae_config, rnn_config = _load_models(folder)
     configs = vae_config, rnn_config
     paths = dataset.episode_paths(folder)
-    provenance, world, facts = _make_provenance(folder), dataset.world_of_folder(folder), None
+    world, rewards = dataset.world_of_folder(folder), RecordedRewards.load(paths)
     preprocessing = dataset.preprocessing_of_drives(paths, vae_config.picture, world)
-    if world != OF_FIRST_WORLD:
-        rewards = RecordedRewards.load(paths)
-        facts = describe_world(world, rewards, rnn_config, reward, end)
-        provenance |= _describe_drives(folder, rewards, facts)
-        warn_of_unsure_ends(facts.end, provenance["quality"])
-    elif reward or end:
-        raise UsageError(f"{world} knows how its dreams pay and end: omit --reward and --end")
-    parts = export_graphs(vae, rnn, initial_latents(folder), *configs, facts)
+    facts = describe_world(world, rewards, rnn_config, reward, end)
+    provenance = _make_provenance(folder, rewards, facts)
+    warn_of_unsure_ends(facts.end, provenance["quality"])
+    parts = export_graphs(vae, rnn, initial_latents(folder), *configs, world)
     if recorded:
         found = compute_recorded_states(folder, recorded)
         if states := len(found.states):
@@ -122,7 +118,7 @@ def assemble(
     if with_weights:
         tensors = {f"vae.{key}": value for key, value in vae.items()} | {f"mdnrnn.{k}": v for k, v in rnn.items()}
         parts[WEIGHTS] = save(tensors)  # without metadata, which it writes in any order: the manifest has the layers
-    manifest = make_manifest(name, provenance, *configs, world, facts, preprocessing)
+    manifest = make_manifest(name, provenance, facts, *configs, world, preprocessing)
     if measurements:
         with TemporaryDirectory() as aside:
             bare = write_bundle(Path(aside) / out.name, manifest, parts).sha256
@@ -152,23 +148,16 @@ def _load_models(folder: Path) -> tuple[Weights, Weights, VAEConfig, MDNRNNConfi
     return vae, rnn, vae_config, rnn_config
 
 
-def _make_provenance(folder: Path) -> dict[str, Any]:
+def _make_provenance(folder: Path, rewards: RecordedRewards, facts: WorldFacts) -> dict[str, Any]:
     """What a bundle's manifest says of its data, the quality of its models, and the packages that trained them."""
     paths = dataset.episode_paths(folder)
+    drivers = Counter(str(dataset.load_arrays(path, "driver")["driver"]) for path in paths)
+    packages = sorted({"dreamfleet", "torch", *facts.packages})
     return {
         "episodes": len(paths),
         "frames": sum(len(dataset.load_arrays(path, "reward")["reward"]) for path in paths),
         "held_out_episodes": len(dataset.split_held_out(paths)[1]),
         "quality": load_quality(folder),
-        "versions": {package: package_version(package) for package in ("dreamfleet", "gymnasium", "torch")},
-    }
-
-
-def _describe_drives(folder: Path, rewards: RecordedRewards, facts: WorldFacts) -> dict[str, Any]:
-    """What the provenance of a world that is described says besides."""
-    drivers = Counter(str(dataset.load_arrays(path, "driver")["driver"]) for path in dataset.episode_paths(folder))
-    packages = sorted({"dreamfleet", "torch", *facts.packages})
-    return {
         "drivers": dict(sorted(drivers.items())),
         "deaths": rewards.deaths,
         "versions": {package: package_version(package) for package in packages},
@@ -190,10 +179,10 @@ def _load_measurements(path: Path) -> tuple[object, dict[str, Any]]:
 
 
 def make_manifest(
-    name: str, provenance: dict[str, Any], vae: VAEConfig = PAPER, rnn: MDNRNNConfig = REWARDED,
-    world: DataWorld = OF_FIRST_WORLD, facts: WorldFacts | None = None, preprocessing: Preprocessing | None = None,
+    name: str, provenance: dict[str, Any], facts: WorldFacts, vae: VAEConfig = PAPER, rnn: MDNRNNConfig = REWARDED,
+    world: DataWorld = OF_FIRST_WORLD, preprocessing: Preprocessing | None = None,
 ) -> BundleManifest:  # fmt: skip
-    """Make the manifest of these models of a data set's world, with what it says of that world.
+    """Make the manifest of these models of a data set's world, with the `facts` of that world.
 
     `preprocessing` is that of its pictures, by default the world's of their size.
     """
@@ -218,16 +207,16 @@ def export_graphs(
     initial: NDArray[np.float32],
     vae_config: VAEConfig = PAPER,
     rnn_config: MDNRNNConfig = REWARDED,
-    facts: WorldFacts | None = None,
+    world: DataWorld = OF_FIRST_WORLD,
 ) -> dict[str, bytes]:
-    """Make the parts of a bundle, by name; those of a world that is described have no graph with a controller."""
+    """Make the parts of a bundle, by name; only the first world's have graphs with a controller."""
     parts = {
         ENCODER: export_encoder(vae, vae_config),
         DECODER: export_decoder(vae, vae_config),
         DREAM_GRAPH: export_dream(rnn, rnn_config),
         INITIAL_LATENTS_PART: _npy(initial),
     }
-    if facts is not None:
+    if world != OF_FIRST_WORLD:
         return parts
     actions = dataset.find_world().world.actions
     assert isinstance(actions, Continuous)

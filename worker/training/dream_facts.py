@@ -34,7 +34,9 @@ class RecordedRewards:
 
     positive: float | None  # mean of the rewards above 0; `None`: there is none
     other: float | None  # mean of the others
-    each_step: float | None  # of every step but a drive's last, which has 0 to this; `None`: they differ, or it is 0
+    each_step: float | None = (
+        None  # of every step but a drive's last, which has 0 to this; `None`: they differ, or it is 0
+    )
     deaths: int = 0
 
     @classmethod
@@ -56,6 +58,9 @@ class RecordedRewards:
         return cls.of([drive["reward"] for drive in drives], sum(bool(drive["terminal"]) for drive in drives))
 
 
+NO_DRIVES = RecordedRewards(None, None, None)  # of an imported model
+
+
 def describe_world(
     world: DataWorld, recorded: RecordedRewards, layers: MDNRNNConfig, reward: Source | None = None,
     end: str | None = None,
@@ -64,18 +69,20 @@ def describe_world(
 
     By default the reward is survival where each recorded step has the same one and the MDN-RNN predicts ends. Otherwise
     it is the value or the label that its reward head predicts. Survival ends by chance, other dreams at 0.5.
-    `UsageError` for a `reward` or `end` that this MDN-RNN does not predict.
+    `UsageError` for a `reward` or `end` that this MDN-RNN does not predict. A model without a reward head may be of a
+    world that says what a label is worth: it serves drives, and no dreams.
     """
-    source = reward or _default_source(recorded, layers)
-    _check_predicted(source, layers)
+    found, source = find_world(*world).world, reward or _default_source(recorded, layers)
+    if reward or found.dream_reward is None or found.dream_reward.source != source:
+        _check_predicted(source, layers)
     if end is not None and not layers.done:
         raise UsageError(
             "--end is about the ends that a done head predicts: `dreamfleet train mdnrnn --set done=true` adds one"
         )
     default = EndRule(DRAWN) if source == "survival" else EndRule()
     rule = replace(EndRule.parse(end) if end else default, odds_weight=layers.done_weight)
-    _warn_of_gaps(source, recorded)
-    found = find_world(*world).world
+    if recorded != NO_DRIVES:
+        _warn_of_gaps(source, recorded)
     return found.facts(_measure_reward(source, recorded, found), rule, world.options)
 
 

@@ -27,7 +27,6 @@ from dreamfleet.worker.worldmodel.inference import open_graph
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 
 ENCODED = "encoded"
-COPIED = ("terminal", "world")  # arrays that some drives have
 BATCH = 100  # pictures
 ENCODER = ("encoder.", "mu.", "logvar.")  # prefixes of its weights' names
 
@@ -39,7 +38,7 @@ def encode(folder: Path) -> Iterator[int]:
     config = load_config(folder / CHECKPOINT, VAEConfig)
     encode_pictures = _make_encoder(folder, config)
     vae, mirrors = encoder_hash(folder), encodes_mirrored(folder)
-    dataset.check_whole(dataset.episode_paths(folder), "picture", "preprocessing", "action", "reward", "ended")
+    dataset.check_whole(dataset.episode_paths(folder), "picture", "preprocessing", "world", "action", "reward", "ended")
     dataset.check_pictures(dataset.episode_paths(folder), config.picture)
     for path in dataset.episode_paths(folder):
         target = folder / ENCODED / path.name
@@ -52,7 +51,7 @@ def encode(folder: Path) -> Iterator[int]:
                 f"{path} holds {plural(len(pictures), 'picture')} and another number of actions; delete it"
             )
         mu, logvar = encode_pictures(pictures)
-        more: dict[str, Any] = dataset.load_arrays(path, optional=COPIED)
+        more: dict[str, Any] = dataset.load_arrays(path, "world", optional=("terminal",))
         if mirrors:
             found = encode_pictures(np.ascontiguousarray(pictures[:, :, ::-1]))
             more |= zip(("mirrored_mu", "mirrored_logvar"), found, strict=True)

@@ -53,7 +53,7 @@ def train_vae(
     `events` is a folder for TensorBoard events.
     """
     train, held_out = dataset.split_held_out(dataset.episode_paths(folder))
-    dataset.check_whole([*train, *held_out], "picture", "preprocessing")
+    dataset.check_whole([*train, *held_out], "picture", "preprocessing", "world")
     dataset.check_pictures([*train, *held_out], layers.picture)
     torch.manual_seed(config.seed)
     model = VAE(layers).to(device)

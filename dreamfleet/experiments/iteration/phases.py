@@ -268,7 +268,7 @@ def other_means(evaluations: Sequence[StoredEvaluation], reported: int | None, c
 def _describe_run(run: RunFolder) -> dict[str, Any]:
     history, confirmed, score = run.history(), run.confirmation(), None
     if (judged := confirmed or best_evaluation(run.evaluations())) is not None:
-        word = Bundle.open(run.bundle_path, run.spec.bundle).manifest.facts.score_word
+        word = Bundle.open(run.bundle_path, run.spec.bundle).manifest.world.score_word
         score = {"mean": judged.mean, "error": judged.error, "word": word, "generation": judged.generation,
                  "episodes": judged.episodes, "confirmed": confirmed is not None}  # fmt: skip
     steps = sum(each.steps for each in history)

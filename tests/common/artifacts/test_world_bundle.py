@@ -1,5 +1,4 @@
 import shutil
-import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +6,7 @@ import pytest
 
 from dreamfleet.common.artifacts.actions import Continuous, one_hot
 from dreamfleet.common.artifacts.bundle import LINEAR_CONTROLLER, MANIFEST, POLICY, Bundle, write_bundle
+from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.car_racing_variants import FACTS, Variant
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.driving import WorldDriving
@@ -76,16 +76,12 @@ def test_what_cannot_be_is_refused(bundle, tmp_path):
         Bundle.open(rewritten)
 
 
-def test_a_bundle_of_car_racing_leaves_its_facts_out_and_has_them_and_no_other_worlds(random_bundle, tmp_path):
-    with zipfile.ZipFile(random_bundle.path) as archive:
-        assert b'"world"' not in archive.read(MANIFEST)
-    manifest = random_bundle.manifest
-    assert manifest.facts == FACTS
-    assert FACTS.actions == Variant().controls == WORLD.actions
-    by_value = replace(manifest, models={"mdnrnn": {"reward": "value"}}).facts
-    assert by_value == replace(FACTS, reward=RewardFacts("value"))
-    moon, parts = replace(manifest, task="moon"), parts_of(random_bundle)
-    for wrong in (moon, replace(manifest, actions=2)):
-        with pytest.raises(BundleError):
-            write_bundle(tmp_path / "moon.zip", wrong, parts)
-    assert write_bundle(tmp_path / "moon.zip", replace(moon, world=FACTS), parts).driving == WorldDriving(FACTS)
+def test_a_bundle_says_its_world_and_car_racings_has_variants(random_bundle, tmp_path):
+    assert random_bundle.manifest.world == find_bundle("tiny").manifest.world == FACTS
+    assert WORLD.facts(FACTS.reward, EndRule()) == FACTS
+    assert FACTS.actions == Variant().controls
+    moon = write_bundle(tmp_path / "m.zip", replace(random_bundle.manifest, task="moon"), parts_of(random_bundle))
+    assert moon.driving == WorldDriving(FACTS)
+    rewrite(moon.path, lambda name, data: data.replace(b'"world"', b'"earth"') if name == MANIFEST else data)
+    with pytest.raises(BundleError, match=r"m\.zip.*world"):
+        Bundle.open(moon.path)

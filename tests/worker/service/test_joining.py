@@ -173,7 +173,7 @@ def test_neither_a_worker_nor_its_child_imports_a_task_that_it_did_not_announce(
 def test_a_world_model_of_an_unannounced_task_imports_nothing(stage, tmp_path, mark):
     small = stage.bundle
     parts = {name: small.read(name) for name in small.manifest.parts}
-    world = replace(small.manifest, task="foreign_world:World", world=small.manifest.facts)
+    world = replace(small.manifest, task="foreign_world:World")
     stage.bundle = write_bundle(tmp_path / "foreign.zip", world, parts)
     stage.hand("dream")
     assert isinstance(stage.error(), RefusedError)

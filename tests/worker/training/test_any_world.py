@@ -165,7 +165,7 @@ def test_features_of_it_predict_actions_that_are_chosen(folder, bundle, tmp_path
     assert not [name for name in found.subspace.names if name.startswith("|")], "a choice has no sign"
 
 
-def test_the_verb_takes_another_reward_and_end_of_any_world_but_the_first(folder, tmp_path, capsys):
+def test_the_verb_takes_another_reward_and_end_of_any_world(folder, tmp_path, capsys):
     out = tmp_path / "b.zip"
     command = ["bundle", "--data", str(folder), "--out", str(out), "--json"]
     assert main([*command, "--end", "0.25"]) == 0

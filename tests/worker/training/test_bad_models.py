@@ -11,6 +11,7 @@ import pytest
 
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH, INITIAL_LATENTS_PART, POLICY, RECORDED_STATES, write_bundle
 from dreamfleet.common.artifacts.bundle_store import find_bundle
+from dreamfleet.common.artifacts.car_racing_variants import FACTS
 from dreamfleet.common.artifacts.onnx_checks import has_finite_weights
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import BundleError, DatasetError
@@ -47,7 +48,7 @@ def test_weights_that_are_no_numbers_are_refused(tmp_path, name, value):
     model[name].flat[3] = value
     parts = export_graphs(*models, np.zeros((1, 2, 4), np.float32), LAYERS, RNN)
     with pytest.raises(BundleError):
-        write_bundle(tmp_path / "b.zip", make_manifest("b", {}, LAYERS, RNN), parts)
+        write_bundle(tmp_path / "b.zip", make_manifest("b", {}, FACTS, LAYERS, RNN), parts)
 
 
 def test_what_ships_and_what_is_no_model_have_no_wrong_weights():
@@ -107,7 +108,7 @@ def test_a_half_written_episode_stops_training_before_its_first_update(folder):
 
 def test_an_episode_without_its_actions_is_refused(folder):
     path = sorted((folder / "episodes").glob("*.npz"))[1]
-    np.savez(path, **load_arrays(path, "picture", "reward", "preprocessing", "ended"))
+    np.savez(path, **load_arrays(path, "picture", "reward", "preprocessing", "world", "ended"))
     with pytest.raises(DatasetError, match=r"action\.npy"):
         list(encode(folder))
 

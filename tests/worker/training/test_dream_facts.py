@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dreamfleet.common.artifacts.car_racing_variants import FACTS
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.scoring.rollout import DataWorld
+from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld
 from dreamfleet.worker.tasks.api import DreamReward
-from dreamfleet.worker.training.dream_facts import RecordedRewards, describe_world, warn_of_unsure_ends
+from dreamfleet.worker.training.dream_facts import NO_DRIVES, RecordedRewards, describe_world, warn_of_unsure_ends
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from tests.support.pixel_world import DodgeTask
 
@@ -62,6 +63,12 @@ def test_by_default_it_is_survival_where_the_data_are_or_else_what_the_model_pre
     assert facts(EARNED, ENDS).reward.source == "survival", "nothing else is predicted"
     assert facts(EARNED, LABEL).reward == RewardFacts("label", gain=3.6, cost=0.1)
     assert facts(EARNED, LABEL).end == EndRule()
+
+
+def test_a_model_without_drives_pays_as_its_world_says(caplog):
+    for layers, reward in ((MDNRNNConfig(reward="none"), FACTS.reward), (LABEL, FACTS.reward), (VALUE, RewardFacts())):
+        assert describe_world(OF_FIRST_WORLD, NO_DRIVES, layers).reward == reward
+    assert not caplog.records
 
 
 def test_what_is_chosen_is_taken_and_what_the_world_says_is_no_figure_of_the_data():

@@ -211,7 +211,7 @@ def test_what_cannot_be_is_refused_before_anything_is_driven(tmp_path, flags, na
 
 
 def test_another_preset_than_the_data_sets_is_refused(tmp_path):
-    (tmp_path / "preset.json").write_text('{"preset": "paper"}')
+    (tmp_path / "preset.json").write_text('{"preset": "paper", "task": "car-racing"}')
     with pytest.raises(UsageError, match="--preset paper"):
         call(tmp_path)
 

@@ -131,7 +131,7 @@ def test_a_later_verb_without_the_data_sets_preset_is_refused(tmp_path, capsys):
     assert "2,115,971" in capsys.readouterr().out
 
 
-def test_a_data_set_from_before_presets_were_kept_stays_without_one(tmp_path):
+def test_a_data_set_that_was_not_begun_by_collect_stays_without_a_preset(tmp_path):
     write_drive(tmp_path, 0)
     store_preset(tmp_path, "article", 0)
     assert load_preset(tmp_path) is None
@@ -139,7 +139,9 @@ def test_a_data_set_from_before_presets_were_kept_stays_without_one(tmp_path):
     assert resolve_preset(tmp_path, None) == "tiny"
 
 
-@pytest.mark.parametrize("content", ["", "[]", "{}", '{"preset": 5}', '{"preset": "dream"}', "[" * 900])
+@pytest.mark.parametrize(
+    "content", ["", "[]", "{}", '{"preset": "paper"}', '{"preset": "dream", "task": ""}', "[" * 900]
+)
 def test_a_damaged_preset_file_is_reported_in_a_line(tmp_path, content):
     (tmp_path / "preset.json").write_text(content)
     with pytest.raises(DatasetError):
@@ -150,11 +152,11 @@ def test_a_data_set_has_one_preset_and_one_seed(tmp_path):
     check_seed(tmp_path, 7)
     store_preset(tmp_path, "paper", 5)
     store_preset(tmp_path, "tiny", 6)
-    assert json.loads((tmp_path / "preset.json").read_text()) == {"preset": "paper", "seed": 5}
+    assert json.loads((tmp_path / "preset.json").read_text()) == {"preset": "paper", "seed": 5, "task": "car-racing"}
     check_seed(tmp_path, 5)
     with pytest.raises(UsageError, match=r"--seed 5.*--seed 7"):
         check_seed(tmp_path, 7)
-    (tmp_path / "preset.json").write_text('{"preset": "paper"}')  # no seed is kept
+    (tmp_path / "preset.json").write_text('{"preset": "paper", "task": "car-racing"}')  # no seed is kept
     check_seed(tmp_path, 7)
 
 

@@ -13,10 +13,12 @@ from dreamfleet.common.host.packages import package_version
 from dreamfleet.worker.addons.importing import checkpoints
 from dreamfleet.worker.addons.importing.json_weights import Weights, read_initial_latents, read_mdnrnn, read_vae
 from dreamfleet.worker.addons.importing.sources import MDRNN, PLACES, VAE, find_checkpoint, find_json
+from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD
 from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.training.assemble import export_graphs, make_manifest  # needs the extra `train`
 from dreamfleet.worker.training.data.data_folder import explain_write_errors
 from dreamfleet.worker.training.data.dataset import find_world
+from dreamfleet.worker.training.dream_facts import NO_DRIVES, describe_world
 from dreamfleet.worker.worldmodel.mdnrnn_config import PAPER as PAPER_RNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import PAPER as PAPER_VAE
@@ -62,6 +64,7 @@ def _write(
     initial: NDArray[np.float32], pictures: Preprocessing | None = None,
 ) -> Bundle:  # fmt: skip
     provenance = {"imported": source, "versions": {"dreamfleet": package_version("dreamfleet")}}
-    manifest = make_manifest(out.stem, provenance, vae[1], rnn[1], preprocessing=pictures)
+    facts = describe_world(OF_FIRST_WORLD, NO_DRIVES, rnn[1])
+    manifest = make_manifest(out.stem, provenance, facts, vae[1], rnn[1], preprocessing=pictures)
     with explain_write_errors(out):
         return write_bundle(out, manifest, export_graphs(vae[0], rnn[0], initial, vae[1], rnn[1]))

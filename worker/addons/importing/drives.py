@@ -21,7 +21,7 @@ from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import open_regular
 from dreamfleet.common.printable import plural
 from dreamfleet.worker.addons.importing.sources import drive_paths
-from dreamfleet.worker.scoring.rollout import write_episode
+from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, write_episode
 from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.training.data.data_folder import explain_folder_errors, explain_write_errors, store_preset
 from dreamfleet.worker.training.data.dataset import episode_path, existing_episodes, find_world, preprocessing_of_size
@@ -106,6 +106,7 @@ def read_drive(path: Path, *, layout: Layout | None = None) -> Drive:
     drive: dict[str, NDArray[Any]] = {
         "picture": pictures, "action": action, "reward": rewards, "ended": np.array(bool(done[-1])),
         "driver": np.array("imported"), "preprocessing": np.array(preprocessing.name),
+        "world": np.array(OF_FIRST_WORLD.text),
     }  # fmt: skip
     return Drive(drive, "reward" in found, layout)
 

@@ -171,7 +171,7 @@ def manifest_facts(bundle: Bundle) -> list[tuple[str, str]]:
         ("attention window", str(model.get("window", 0) or "none")),
         ("recorded states", str(bundle.recorded_count or "none")),
     ]
-    facts, reward = manifest.facts, manifest.facts.reward
+    facts, reward = manifest.world, manifest.world.reward
     cost = f" - {reward.cost:g}" if reward.cost else ""
     rows += [("options", facts.options or "none"), ("reward of a dream", f"{reward.gain:g} x {reward.source}{cost}")]
     rows += [("a dream ends", _end_text(facts.end))]

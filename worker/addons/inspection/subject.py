@@ -147,7 +147,7 @@ def check_same_pictures(own: Bundle, bundle: Bundle) -> None:
 
 def _pictures_of(bundle: Bundle) -> tuple[str, str, str]:
     manifest = bundle.manifest
-    return manifest.task, manifest.facts.options, manifest.preprocessing
+    return manifest.task, manifest.world.options, manifest.preprocessing
 
 
 def make_driver_actors(bundle: Bundle, name: str) -> Callable[[int], Actor]:

@@ -147,7 +147,7 @@ def _worker_pictures(args: argparse.Namespace, client: Client) -> Iterator[Itera
             bundle = fetch_bundle_now(client.session, view.run, spec.bundle)
             fitting, task = bundle.with_options(spec.controller, spec.options), bundle.manifest.task
             own = spec.task in (DREAM, task)  # actions of another task are not the world model's
-            names, actions = (bundle.manifest.facts.action_names, fitting.driving.controls) if own else ((), None)
+            names, actions = (bundle.manifest.world.action_names, fitting.driving.controls) if own else ((), None)
             canvas = LiveCanvas(view.run, names, LiveDreamer(fitting, args.temperature), actions, task)
         print(f"watching run {view.run}; its workers: {view.status.workers.present}", file=sys.stderr)
         yield worker_frames(view, canvas, args.fps)

@@ -114,7 +114,7 @@ class SplitSums:
 
 def check_drives(paths: Sequence[Path], bundle: Bundle) -> None:
     """`DatasetError` for a damaged drive, or one of another world or other pictures than the bundle's."""
-    check_whole(paths, "picture", "preprocessing", "action", "reward", "ended")
+    check_whole(paths, "picture", "preprocessing", "world", "action", "reward", "ended")
     world, seen = DataWorld.of(bundle), bundle.manifest.preprocessing
     for path in paths:
         own, found = kind_of(path)

@@ -26,13 +26,13 @@ def store_preset(folder: Path, preset: str, seed: int, world: DataWorld = OF_FIR
     """
     path = folder / dataset.BEGUN
     if not path.exists() and not dataset.existing_episodes(folder):
-        own = {name: value for name, value in world._asdict().items() if value} if world != OF_FIRST_WORLD else {}
+        own = {name: value for name, value in world._asdict().items() if value}
         with explain_folder_errors(folder), atomic_write(path) as file:
             file.write(json.dumps({"preset": preset, "seed": seed, **own}).encode())
 
 
 def load_preset(folder: Path) -> str | None:
-    """The preset of a data set; `None` for old data sets, and for those without `collect`."""
+    """The preset of a data set; `None` for one that `collect` did not begin."""
     begun = dataset.load_begun(folder)
     try:
         return check_preset("training", begun["preset"]) if begun else None
@@ -43,7 +43,7 @@ def load_preset(folder: Path) -> str | None:
 
 
 def check_seed(folder: Path, seed: int) -> None:
-    """`UsageError` if the data set was begun with another seed; old data sets have stored none."""
+    """`UsageError` if the data set was begun with another seed; one that `collect` did not begin has none."""
     own = dataset.load_begun(folder).get("seed", seed)
     if own != seed:
         raise UsageError(

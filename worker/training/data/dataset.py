@@ -60,17 +60,17 @@ def preprocessing_of_drives(paths: Sequence[Path], size: int, world: DataWorld =
 
 
 def load_begun(folder: Path) -> dict[str, Any]:
-    """What a data set was begun with: `preset`, `seed`, and its world if that is not the first; empty if nothing is."""
+    """What a data set was begun with: `preset`, `seed`, `task` and its options, if any; empty if nothing is."""
     path = folder / BEGUN
     if not path.exists():
         return {}
     try:
         begun = json.loads(read_text(path, BEGUN_BYTES))
-        if not all(isinstance(begun[name], str) for name in ("preset", *({"task", "options"} & set(begun)))):
+        if not all(isinstance(begun[name], str) for name in ("preset", "task", *({"options"} & set(begun)))):
             raise TypeError(f"it holds {begun!r:.100}")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise DatasetError(
-            f"{path} names no preset ({error}); write the one that collected the data into it"
+            f"{path} names no preset and task ({error}); write those that collected the data into it"
         ) from error
     return dict(begun)
 
@@ -78,7 +78,7 @@ def load_begun(folder: Path) -> dict[str, Any]:
 def find_own_world(folder: Path) -> DataWorld | None:
     """The world that a data set was begun in, or of its first drive; `None` for an empty folder."""
     if begun := load_begun(folder):
-        return DataWorld(begun.get("task", FIRST_WORLD), begun.get("options", ""))
+        return DataWorld(begun["task"], begun.get("options", ""))
     drives = (sorted((folder / kind).glob("[0-9]*.npz")) for kind in ("episodes", "encoded"))
     first = next((paths[0] for paths in drives if paths), None)
     if first is None:
@@ -94,8 +94,7 @@ def world_of_folder(folder: Path) -> DataWorld:
 
 def world_of_episode(path: Path) -> DataWorld:
     """The world that an episode, or an encoded one, was driven in."""
-    found = load_arrays(path, optional=("world",)).get("world", "")
-    return DataWorld.parse(str(found))
+    return DataWorld.parse(str(load_arrays(path, "world")["world"]))
 
 
 def episode_path(folder: Path, number: int) -> Path:
@@ -213,15 +212,15 @@ def check_pictures(
 
 def kind_of(path: Path) -> tuple[DataWorld, str]:
     """The world of an episode, and the name of the preprocessing of its pictures."""
-    arrays = load_arrays(path, "preprocessing", optional=("world",))
-    return DataWorld.parse(str(arrays.get("world", ""))), str(arrays["preprocessing"])
+    arrays = load_arrays(path, "preprocessing", "world")
+    return DataWorld.parse(str(arrays["world"])), str(arrays["preprocessing"])
 
 
 def load_pictures(path: Path) -> NDArray[np.uint8]:
     """Load an episode's pictures `(T, side, side, 3)`; `DatasetError` if they do not match its preprocessing."""
-    arrays = load_arrays(path, "picture", "preprocessing", optional=("world",))
+    arrays = load_arrays(path, "picture", "preprocessing", "world")
     pictures: NDArray[np.uint8] = arrays["picture"]
-    world = DataWorld.parse(str(arrays.get("world", "")))
+    world = DataWorld.parse(str(arrays["world"]))
     known = find_world(*world).preprocessings.get(str(arrays["preprocessing"]))
     fits = known is not None and pictures.ndim == 4 and pictures.shape[1:] == known.shape
     if not fits or not len(pictures) or pictures.dtype != np.uint8:

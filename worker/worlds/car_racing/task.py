@@ -37,6 +37,7 @@ WORLD = World(
     actions=STEERING_GAS_BRAKE,
     packages=FACTS.packages,
     idle_cost=0.1,
+    horizon=FACTS.horizon,
     frames_per_second=FACTS.frames_per_second,
     action_names=FACTS.action_names,
     dream_reward=DreamReward(gain=FACTS.reward.gain, cost=FACTS.reward.cost),

@@ -138,7 +138,7 @@ class TakeCoverTask(Task):
         if assignment.bundle is None:
             return self.with_options(assignment.spec.options)
         manifest = assignment.bundle.manifest
-        return self if manifest.task != self.name else self.with_options(manifest.facts.options)
+        return self if manifest.task != self.name else self.with_options(manifest.world.options)
 
     def _make_game(self) -> TakeCover:
         return TakeCover(self._options.tics)

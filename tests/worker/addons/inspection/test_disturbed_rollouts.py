@@ -119,6 +119,6 @@ def test_a_driver_that_never_comes_far_begins_anywhere(tiny):
 def test_a_world_without_true_state_is_reported(tmp_path):
     ours = write_random_bundle(tmp_path / "ours.zip", vae=SMALL, rnn=RNN)
     parts = {name: ours.read(name) for name in ours.manifest.parts}
-    toy = write_bundle(tmp_path / "toy.zip", replace(ours.manifest, task=TOY, world=ours.manifest.facts), parts)
+    toy = write_bundle(tmp_path / "toy.zip", replace(ours.manifest, task=TOY), parts)
     with pytest.raises(UsageError):
         drive(toy, drivers)

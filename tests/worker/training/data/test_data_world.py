@@ -24,6 +24,7 @@ from dreamfleet.worker.training.data.dataset import (
     existing_episodes,
     find_own_world,
     find_world,
+    load_arrays,
     load_pictures,
     load_steps,
     pad,
@@ -73,7 +74,7 @@ def test_a_drive_in_any_world_is_a_function_of_seed_and_number_and_says_its_worl
     assert load_steps(path)["action"].shape == (4, 3)
     assert str(first["driver"]) in find_world(*world).drivers
     assert world_of_episode(path) == world_of_folder(tmp_path) == find_own_world(tmp_path) == world
-    assert ("world" in first) == (world != OF_FIRST_WORLD)
+    assert str(first["world"]) == world.text
 
 
 def test_a_process_keeps_its_environment_until_a_drive_fails(monkeypatch):
@@ -112,8 +113,7 @@ def encoded_drive(folder, number, path, **more):
     target.parent.mkdir(exist_ok=True)
     noise = np.random.default_rng(number).standard_normal((len(steps["reward"]), 4)).astype(np.float32)
     named = dict.fromkeys(("mu", "logvar", "mirrored_mu", "mirrored_logvar"), noise)
-    kept = {} if world_of_episode(path) == OF_FIRST_WORLD else {"world": np.array(world_of_episode(path).text)}
-    np.savez(target, **steps, **named, **kept, **more)
+    np.savez(target, **steps, **named, **load_arrays(path, "world"), **more)
     return target
 
 

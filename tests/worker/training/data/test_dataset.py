@@ -18,7 +18,7 @@ from dreamfleet.worker.training.data.dataset import (
     split_held_out,
 )
 from dreamfleet.worker.training.data.rollouts import load_rollouts
-from tests.support.drives import write_drive, write_drives
+from tests.support.drives import write_drive, write_drives, write_encoded
 from tests.support.mutations import Watched, archives
 
 NAMES = ("picture", "action", "reward", "preprocessing")
@@ -73,13 +73,10 @@ def test_damaged_drives_are_read_or_refused_in_one_line(tmp_path, watched):
 
 
 def test_damaged_encoded_drives_are_read_or_refused_in_one_line(tmp_path, watched):
-    path, count = tmp_path / "e.npz", 0
-    names = ("mu", "logvar", "mirrored_mu", "mirrored_logvar")
-    latents = dict.fromkeys(names, np.zeros((5, 4), np.float32))
-    np.savez(path, **latents, action=np.zeros((5, 3), np.float32), reward=np.zeros(5, np.float32), ended=np.array(True))
+    (path,), count = write_encoded(tmp_path, np.zeros((1, 5)), ended=True), 0
     for data in archives(path.read_bytes(), DAMAGES, seed=7):
         path.write_bytes(data)
-        count += watched.read(DatasetError, lambda: load_rollouts([path], np.array([True])))
+        count += watched.read(DatasetError, lambda: load_rollouts([path]))
     assert 0 < count < DAMAGES
 
 
