@@ -1,7 +1,5 @@
 """The errors that users see. Each text says what happened and what to do about it."""
 
-from __future__ import annotations
-
 import shlex
 from errno import EACCES, EDQUOT, EISDIR, ENOSPC, EPERM, EROFS
 from typing import Any

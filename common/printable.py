@@ -1,7 +1,5 @@
 """Untrusted text made safe for a terminal, and values formatted for people."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """Bounds of settings, as their annotations say them."""
 
-from __future__ import annotations
-
 import sys
 from typing import Annotated, Any, get_args, get_type_hints
 

@@ -6,8 +6,6 @@ name is a space on the command line: `train.vae` is `dreamfleet train vae`. Only
 and it imports heavy packages in `run`.
 """
 
-from __future__ import annotations
-
 import argparse
 import errno
 import logging

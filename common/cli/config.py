@@ -5,8 +5,6 @@ the environment, its field names as flags. The unnamed section is the top of the
 key is an error that suggests the nearest one. A section's field `preset`, if it has one, names the preset.
 """
 
-from __future__ import annotations
-
 import argparse
 import tomllib
 import types

@@ -3,8 +3,6 @@
 In a TOML file these keys come first, before any table; in the environment they are `DREAMFLEET_CONNECT` and so on.
 """
 
-from __future__ import annotations
-
 import argparse
 import logging
 import os

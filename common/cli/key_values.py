@@ -1,7 +1,5 @@
 """Texts of flags: KEY=VALUE, and flags of another verb."""
 
-from __future__ import annotations
-
 import json
 import shlex
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """What `dreamfleet --help` shows: the verbs by what people do with them, one short line each."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from textwrap import wrap
 

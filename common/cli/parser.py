@@ -1,7 +1,5 @@
 """The parser of a verb: one-line errors that suggest what was meant, and help in two lengths."""
 
-from __future__ import annotations
-
 import argparse
 import difflib
 import sys

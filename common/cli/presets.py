@@ -4,8 +4,6 @@ The coordinator and the worker define their own presets. The names are here so t
 preset of that name.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 from dreamfleet.common.artifacts.driving import FIRST_WORLD

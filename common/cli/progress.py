@@ -1,7 +1,5 @@
 """Progress bars."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Iterable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """The flags of a data set's world: the task, and what is seen of it, which the task's `parse_options` takes."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

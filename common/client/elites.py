@@ -1,7 +1,5 @@
 """The best candidate of each cell, whichever optimiser asked for it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Generations in a row whose candidates all have one fitness: a search that has nothing to go by. Pure."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 

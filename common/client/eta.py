@@ -1,7 +1,5 @@
 """How far a run is on the way to its real end, and how long the rest takes, by its status. No input or output."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

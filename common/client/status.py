@@ -4,8 +4,6 @@ It is a consistent snapshot. Long lists are truncated, with their total beside t
 message limit; the parts `workers`, `history`, `evaluations` and `candidates` return them page by page.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal

@@ -4,8 +4,6 @@ Every reader of a bundle, a controller, a rollout or an optimiser's state uses t
 before anything is unpacked, and unpacked sizes against the declared ones. Pickle is never loaded.
 """
 
-from __future__ import annotations
-
 import io
 import math
 import re

@@ -1,7 +1,5 @@
 """Atomic writes, and checks of a verb's `--out` before it works for minutes."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

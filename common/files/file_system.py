@@ -1,7 +1,5 @@
 """Whether a folder's file system keeps the locks that a journal needs; network file systems may not."""
 
-from __future__ import annotations
-
 import fcntl
 import sqlite3
 import tempfile

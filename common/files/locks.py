@@ -1,7 +1,5 @@
 """Advisory locks (flock) on files and folders. The kernel releases a lock when its holder ends."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import time

@@ -1,7 +1,5 @@
 """Opening untrusted paths: only regular files, up to a maximum size."""
 
-from __future__ import annotations
-
 import errno
 import os
 import stat

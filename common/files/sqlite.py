@@ -1,7 +1,5 @@
 """SQLite databases: a connection for each thread that reads one, and what an error says of one."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections.abc import Callable
 from threading import Lock, local

@@ -1,7 +1,5 @@
 """What add-ons offer the core, by entry point: the core imports none, and starts without them."""
 
-from __future__ import annotations
-
 from importlib.metadata import entry_points
 from typing import Any
 

@@ -5,8 +5,6 @@ too if it left the session or lost its parent. Not found is one that left the se
 As a script, this file is the guard: when the process that started it ends, also by SIGKILL, it ends the descendants.
 """
 
-from __future__ import annotations
-
 import atexit
 import itertools
 import os

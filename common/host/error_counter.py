@@ -4,8 +4,6 @@ No message of a peer may end a loop: a message whose handler raises is dropped, 
 matters. Every drop is counted; the log gets the first of a kind, then ever fewer.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import traceback

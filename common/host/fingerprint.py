@@ -4,8 +4,6 @@ Equal fingerprints do not guarantee equal bits; host classes compare the results
 (`common/protocol/host_classes.py`).
 """
 
-from __future__ import annotations
-
 import platform
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Code of other packages in this process, such as a simulator that is made: what it changes here is undone."""
 
-from __future__ import annotations
-
 import logging
 import os
 import sys

@@ -4,8 +4,6 @@ Text is short: the time of day, with the date in a day's first line, the level u
 record may carry named values (`log_event`): JSON includes them, text does not.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import sys

@@ -1,7 +1,5 @@
 """The packages of this distribution and its extras, and the command that installs them."""
 
-from __future__ import annotations
-
 import re
 import sys
 import warnings

@@ -3,8 +3,6 @@
 `python -m dreamfleet.common.host.parent_death PARENT_PID COMMAND` runs a command that ends with the parent.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import signal

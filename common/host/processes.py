@@ -1,7 +1,5 @@
 """Dreamfleet's verbs as child processes, for the demonstration, the benchmarks, experiments and tests."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import shutil

@@ -1,7 +1,5 @@
 """What a verb reports to the program that started it: named values, each a line of JSON, beside what it logs."""
 
-from __future__ import annotations
-
 import json
 import os
 from contextlib import suppress

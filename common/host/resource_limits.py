@@ -1,7 +1,5 @@
 """Resource limits of this process: cores, memory, open files, and the threads of numeric libraries."""
 
-from __future__ import annotations
-
 import errno
 import math
 import os

@@ -1,7 +1,5 @@
 """When a process that drives episodes counts as hung: it made no step for too long."""
 
-from __future__ import annotations
-
 from time import monotonic
 
 STALL_SECONDS = 30.0  # without a step, after which an episode is given up

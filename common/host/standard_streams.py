@@ -6,8 +6,6 @@ logs. So a background thread writes. Its queue is bounded; further lines are dro
 the reader is back.
 """
 
-from __future__ import annotations
-
 import atexit
 import io
 import logging

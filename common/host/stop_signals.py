@@ -1,7 +1,5 @@
 """Handling Ctrl-C and SIGTERM in long-running verbs: a clean stop, an interrupt, or a short delay."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

@@ -3,8 +3,6 @@
 They stand in an environment variable, so that the processes that this one starts trust the same ones.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """Drawing of simulators without a display: each graphics library has a variable of its own that says how."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys

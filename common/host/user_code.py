@@ -5,8 +5,6 @@ must not see that: it sees the arguments of the program that started the run, as
 name alone.
 """
 
-from __future__ import annotations
-
 import json
 import linecache
 import os

@@ -1,7 +1,5 @@
 """How much of a run was checked by other hosts, and what came of it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Annotated
 

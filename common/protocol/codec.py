@@ -4,8 +4,6 @@ A payload never becomes an object if it is oversize, not msgpack, of another ver
 value of a wrong type, out of range, or NaN. `CountingDecoder` counts such payloads by reason instead of raising.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 from collections import Counter

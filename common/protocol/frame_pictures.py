@@ -1,7 +1,5 @@
 """Pictures of live frames: shrunk and packed for sending, checked when unpacked."""
 
-from __future__ import annotations
-
 import zlib
 
 import numpy as np

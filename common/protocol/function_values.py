@@ -3,8 +3,6 @@
 Journal, wire, JSON and tables for programs hold fitness; text, pictures and pages show values.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from functools import lru_cache

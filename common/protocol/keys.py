@@ -1,7 +1,5 @@
 """Zenoh keys of protocol version 2, and the names that they may contain."""
 
-from __future__ import annotations
-
 import re
 import secrets
 import socket

@@ -3,8 +3,6 @@
 The worker checks them so that its message fits the schema, the coordinator before it writes the journal.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 

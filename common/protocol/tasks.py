@@ -6,8 +6,6 @@ A name is one that a package registers in the entry-point group `dreamfleet.task
 A name may come from a file or a message of somebody else, so only a trusted module is imported.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Mapping

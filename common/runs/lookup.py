@@ -1,7 +1,5 @@
 """Finding controllers, world models and subspaces by the name of a file, a run, or a shipped artifact."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path

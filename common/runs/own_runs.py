@@ -3,8 +3,6 @@
 A file in the user's state folder remembers each. Nothing that travels says it: not a run's folder, and not the cache.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import os

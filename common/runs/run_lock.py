@@ -1,7 +1,5 @@
 """The lock on a run's folder: one process at a time writes, moves or deletes it."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress

@@ -1,7 +1,5 @@
 """Paths of runs on disk: the files in a run's folder, the list of runs, and the command that resumes one."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager

@@ -3,8 +3,6 @@
 0-9999 unused; 10000-19999 test; 20000-999999 validation; training from 2**20 up.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 

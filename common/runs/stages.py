@@ -5,8 +5,6 @@ before it, and of evaluations that are at least one interval old. So a run that 
 bit-identically.
 """
 
-from __future__ import annotations
-
 import hashlib
 from bisect import bisect
 from collections.abc import Iterable, Iterator, Mapping, Sequence

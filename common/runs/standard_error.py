@@ -3,8 +3,6 @@
 It follows from the sample's standard deviation, with n - 1 in the denominator. One value has none: `None`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from statistics import stdev

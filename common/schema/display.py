@@ -1,7 +1,5 @@
 """How objects that users hold look: one line in a REPL, a small table in a notebook."""
 
-from __future__ import annotations
-
 from dataclasses import MISSING, fields
 from html import escape
 from typing import Any

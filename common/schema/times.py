@@ -1,7 +1,5 @@
 """Times as text: the clocks of hosts gave them, so one may be set back or forward, and one may be missing."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 
 from dreamfleet.common.printable import printable

@@ -4,8 +4,6 @@ Messages in msgpack are msgspec's structs, which it checks alone. Documents in J
 leaves open which fields are missing or unknown. `from_plain` checks that too, and numbers and texts that only JSON has.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Callable

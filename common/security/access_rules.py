@@ -5,8 +5,6 @@ with rules from the start. A worker's name ends in its seat, and the rules of se
 whenever its join file was issued. Everything else is denied, silently.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from typing import Any
 

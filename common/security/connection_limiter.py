@@ -7,8 +7,6 @@ connections are unauthenticated, a socket filter makes the kernel drop packets o
 newcomer's kernel retries. Linux only: elsewhere there is no limit.
 """
 
-from __future__ import annotations
-
 import ctypes
 import logging
 import os

@@ -5,8 +5,6 @@ as `worker.17`: the certificate's common name, or the user name with passwords. 
 `access`.
 """
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import json

@@ -5,8 +5,6 @@ its ends are played in memory: this needs neither a network nor the extra `acces
 only that it could not connect.
 """
 
-from __future__ import annotations
-
 import socket
 import ssl
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """The key by which a worker shows that it is on the coordinator's own host: a file that only their user can read."""
 
-from __future__ import annotations
-
 import hmac
 import os
 import secrets

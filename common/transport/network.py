@@ -1,7 +1,5 @@
 """Network endpoints. Imports no transport library, so that every verb can import it quickly."""
 
-from __future__ import annotations
-
 import re
 import socket
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Zenoh queries that collect replies: the last one for each key, or every responder's."""
 
-from __future__ import annotations
-
 import queue
 from collections.abc import Callable, Iterable, Iterator
 from time import monotonic

@@ -4,8 +4,6 @@ Zenoh's defaults listen on all interfaces with multicast scouting and gossip, us
 messages ten times slower, and allow 1000 sessions. The configuration here changes all of these.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import queue

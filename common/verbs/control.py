@@ -1,7 +1,5 @@
 """`dreamfleet pause|resume|drain|stop`: steer a run over Zenoh."""
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import dataclass
 

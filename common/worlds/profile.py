@@ -1,7 +1,5 @@
 """What a world that ships says of itself to every host: its presets, its published scores, its demonstration."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """What a scored seed is called in reports, a track or a game, and what a score counts."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from pathlib import Path
 

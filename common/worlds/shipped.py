@@ -1,7 +1,5 @@
 """The worlds that packages register at `dreamfleet.worlds`. A gymnasium environment needs no profile."""
 
-from __future__ import annotations
-
 from dreamfleet.common.host.add_ons import load_registered
 from dreamfleet.common.worlds.profile import WorldProfile
 

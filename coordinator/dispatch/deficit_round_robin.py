@@ -6,8 +6,6 @@ a dreamt one. A deficit counter (Shreedhar and Varghese 1995): each second that 
 and a job that was given by its share costs its seconds.
 """
 
-from __future__ import annotations
-
 SMOOTHING = 0.1  # weight of the newest job in the typical duration
 OUTLIER = 10  # times the typical duration: a longer one comes from a suspended host or a wrong clock
 

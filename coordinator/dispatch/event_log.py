@@ -1,7 +1,5 @@
 """The latest events of jobs and workers: a bounded log of typed events. Pure: events and a clock in."""
 
-from __future__ import annotations
-
 from collections import OrderedDict, deque
 from collections.abc import Collection, Iterator, Sequence
 from typing import Literal, NamedTuple

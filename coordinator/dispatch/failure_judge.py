@@ -1,7 +1,5 @@
 """What failed attempts prove: a broken host, or an episode that fails wherever it is scored. Pure."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """One failed attempt at a job, and the pause before the next one. Pure."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from dreamfleet.common.protocol.failures import Failure

@@ -4,8 +4,6 @@ No message is trusted to arrive. A batch is kept until its worker confirms it, a
 result, and a job that heartbeats do not list is given again.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import count

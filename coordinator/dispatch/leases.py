@@ -1,7 +1,5 @@
 """Who holds which job: a lease stands with its worker and with its job, and both change together here. Pure."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable
 

@@ -1,7 +1,5 @@
 """What the coordinator knows of one worker: its state, leases, unconfirmed batches and speed. Pure."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Set

@@ -1,7 +1,5 @@
 """What a worker is sent: jobs, cancellations and verdicts, cut into batches that fit the message limit."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """The jobs without a result: who holds them, in which order they are given, which failed. Pure."""
 
-from __future__ import annotations
-
 import heapq
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set

@@ -1,7 +1,5 @@
 """Which workers may join a run: those of its protocol and task, and of its class if the run is strict. Pure."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES

@@ -4,8 +4,6 @@ R17: an idle slot first takes a job that waits elsewhere; then it copies a strag
 without a recent record, beside one with a record, first gets a trial copy of a job, for which nobody waits.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ should return before the others have finished the rest, so a bad worker does not
 which the run waits go to the least loaded worker, so that no slot idles.
 """
 
-from __future__ import annotations
-
 import heapq
 import math
 from collections.abc import Collection, Mapping

@@ -3,8 +3,6 @@
 R28: an evaluation is computed only from accepted results on fixed tracks, so a restart gives the same value.
 """
 
-from __future__ import annotations
-
 from bisect import bisect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass

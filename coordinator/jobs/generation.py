@@ -1,7 +1,5 @@
 """One generation: a population, its jobs, the results so far. Pure: no clock, no transport."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isnan

@@ -1,7 +1,5 @@
 """Rollouts of the mean that are kept, so that the next world model learns from what evolved controllers see."""
 
-from __future__ import annotations
-
 from collections.abc import Container, Iterable
 from contextlib import suppress
 from dataclasses import dataclass

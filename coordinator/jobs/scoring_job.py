@@ -1,7 +1,5 @@
 """Jobs, made from a parameter vector and seeds."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -3,8 +3,6 @@
 R26: memory is bounded whatever arrives: a number of uploads, a number of bytes, and a time without progress.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ The only module that a third party imports. Register a class under the entry-poi
 name it as `module:attribute`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol

@@ -1,7 +1,5 @@
 """CMA-ES by Hansen's own library, pycma, with a full or a diagonal covariance matrix."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Mapping, Sequence

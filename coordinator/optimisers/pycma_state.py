@@ -6,8 +6,6 @@ which costs a few kilobytes and needs no list of names that the next version of 
 continued and uninterrupted runs for each covariance model.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from typing import Any

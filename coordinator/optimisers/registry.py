@@ -1,7 +1,5 @@
 """Optimisers by name: those registered under the entry-point group, and any as `module:attribute`."""
 
-from __future__ import annotations
-
 import difflib
 import inspect
 import re

@@ -1,7 +1,5 @@
 """Which hosts may add to a run: those that know its task and, if the run is strict, compute like its first host."""
 
-from __future__ import annotations
-
 from dreamfleet.common.protocol.host_classes import effective_class
 from dreamfleet.common.protocol.messages import HelloRequest
 from dreamfleet.common.runs.records import RunSettings

@@ -1,7 +1,5 @@
 """Jobs that a run wants beside scoring, for idle slots: evaluate its mean, collect rollouts of it, confirm the end."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from functools import partial
 from math import isnan, nan

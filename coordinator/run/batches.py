@@ -3,8 +3,6 @@
 No transport: the service hands over what a query says, and sends the reply once the journal has committed.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

@@ -1,7 +1,5 @@
 """The generations of a run without a search of its own: each is a batch that somebody submitted."""
 
-from __future__ import annotations
-
 from typing import cast
 
 import numpy as np

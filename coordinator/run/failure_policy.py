@@ -1,7 +1,5 @@
 """When failures pause a run (R8): too many candidates fail, or no host can score."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 
 from dreamfleet.common.printable import plural

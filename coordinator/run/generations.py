@@ -1,7 +1,5 @@
 """A run's generations: ask the strategy for a population, journal it, and return the fitness to the strategy."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

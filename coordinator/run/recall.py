@@ -3,8 +3,6 @@
 A check finds a host wrong (R32), or the operator names it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from contextlib import closing
 from pathlib import Path

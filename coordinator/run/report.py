@@ -4,8 +4,6 @@ While the run goes on, its best evaluated mean; that is provisional, for the bes
 end, the confirmed mean, with a score on which no choice was based. Without evaluations, the last mean.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path

@@ -4,8 +4,6 @@ Everything that happens is durable before a worker hears that it counts: `commit
 of a generation may be sent before it is durable: a coordinator that dies in between asks for the same population again.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from math import nan

@@ -1,7 +1,5 @@
 """A run's state as the status and the replies about batches show it: a word, and why."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from dreamfleet.common.protocol.stop_kind import PauseKind

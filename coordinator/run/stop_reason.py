@@ -1,7 +1,5 @@
 """Why a run ends: its limits, or a search that has converged to one point."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 

@@ -4,8 +4,6 @@ R32: which results are drawn follows from a secret of the run, so no worker can 
 on the draw. A generation, and an evaluation, waits for its checks as long as a host is here that can answer.
 """
 
-from __future__ import annotations
-
 import hmac
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 No transport: the service decodes what arrives and sends what is returned.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict
 
 from msgspec.structs import replace

@@ -1,7 +1,5 @@
 """Queries about batches, answered by the service's thread once the journal has committed what they changed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import zenoh

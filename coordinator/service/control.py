@@ -1,7 +1,5 @@
 """The control verbs that steer a run: pause, resume, drain, stop, disband, bar, unbar. No transport."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 

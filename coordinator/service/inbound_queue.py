@@ -5,8 +5,6 @@ answered; a missed departure shows as silence. So events beyond a bound are drop
 memory, and a flood of one kind leaves room for the others.
 """
 
-from __future__ import annotations
-
 import math
 import queue
 import threading

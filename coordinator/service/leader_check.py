@@ -4,8 +4,6 @@ A token alone proves little: it may outlive a killed coordinator. So each coordi
 one that does not answer counts only once its token has outlived the lease.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from dreamfleet.common.protocol.messages import ClaimNote

@@ -1,7 +1,5 @@
 """A coordinator's claim to its run's name on the network: of two coordinators of one name, one must leave."""
 
-from __future__ import annotations
-
 import queue
 from contextlib import ExitStack, suppress
 from time import monotonic, time

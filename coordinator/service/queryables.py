@@ -3,8 +3,6 @@
 No query ends a thread or the run: an exception is counted, logged and answered as an error.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from contextlib import suppress

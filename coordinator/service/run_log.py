@@ -1,7 +1,5 @@
 """What a coordinator logs about its run while it serves it."""
 
-from __future__ import annotations
-
 import logging
 import math
 import shlex

@@ -3,8 +3,6 @@
 Life: startup (session, name lock, queryables) -> loop (events, advance, commit, dispatch) -> shutdown.
 """
 
-from __future__ import annotations
-
 import logging
 import queue
 import secrets

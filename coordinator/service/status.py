@@ -1,7 +1,5 @@
 """Answers of the `status` keys, cut from a snapshot of the run: JSON that stays under the message limit. Pure."""
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Callable, Iterable

@@ -3,8 +3,6 @@
 Each setting is one field. The bounds are in its annotation; `frozen_option` names the record that stores it.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field, fields
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """The settings that a new run freezes in its journal, made of its configuration and checked against its world."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Where a run's curves are written while it goes on: the setting `log_to`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

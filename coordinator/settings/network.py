@@ -1,7 +1,5 @@
 """Where a run is reached, and how it treats its workers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Settings of runs to begin with, by name."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from dreamfleet.common.cli.presets import check_preset

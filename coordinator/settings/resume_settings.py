@@ -4,8 +4,6 @@ Both are facts of the journal, as JSON of what differs from the defaults. What a
 when a run is continued is stronger, and is kept from then on.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import fields, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Drawing up the receipt of a run's controller, from what its journal holds at that moment."""
 
-from __future__ import annotations
-
 import platform
 from functools import cache
 

@@ -1,7 +1,5 @@
 """What a new run is and when it ends, from flags, environment and configuration file."""
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 

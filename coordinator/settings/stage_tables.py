@@ -1,7 +1,5 @@
 """A schedule as it is given: stages in a file of their own, or as `[[stage]]` in a configuration file."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Where a new run may begin instead of at zero: a controller's parameters, or the mean of another run."""
 
-from __future__ import annotations
-
 import base64
 import json
 from contextlib import suppress

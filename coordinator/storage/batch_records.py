@@ -1,7 +1,5 @@
 """The batches in a journal: what others submitted to a run without a search of its own."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The checksums in a journal, which are written with the commit that makes their rows final."""
 
-from __future__ import annotations
-
 from dreamfleet.common.runs.journal import checksums
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
 from dreamfleet.coordinator.storage.journal_connection import JournalConnection

@@ -4,8 +4,6 @@ SQLite goes on writing into a file that has lost its name, and nobody would noti
 file with it. So names are compared with what was opened, about once a second and before the run ends.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import time

@@ -1,7 +1,5 @@
 """The connection of a journal's only writer: writes wait in memory until a commit, which a full disk only delays."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress

@@ -1,7 +1,5 @@
 """The SQLite file of a journal: its side files, its stamp, a check, a checked copy, and SQLite's errors in words."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager

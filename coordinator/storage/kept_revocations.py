@@ -3,8 +3,6 @@
 A fact of the journal, as JSON: a list of seats for each authority, by the hash of its certificate.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection
 

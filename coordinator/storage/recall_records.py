@@ -1,7 +1,5 @@
 """Removes results of barred hosts from a journal, and everything computed from them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection, Iterable, Sequence
 from itertools import groupby

@@ -1,7 +1,5 @@
 """The accepted results in a journal, by generation or by their jobs' digests, and their totals."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """The world model that a run serves: read through one open file, which outlives its name and which nobody can take."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path

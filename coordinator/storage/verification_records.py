@@ -1,7 +1,5 @@
 """What a journal holds of checked results: the key of the draw, the outcomes, and the hosts that are barred."""
 
-from __future__ import annotations
-
 import json
 import secrets
 from collections import Counter

@@ -1,7 +1,5 @@
 """`dreamfleet bar`: keep a host out of a run that the operator knows to score wrongly, or let it in again."""
 
-from __future__ import annotations
-
 import argparse
 from time import monotonic, sleep
 

@@ -1,7 +1,5 @@
 """Actors, which choose the actions of a drive: a controller with its world model."""
 
-from __future__ import annotations
-
 from typing import Any, Protocol
 
 import numpy as np

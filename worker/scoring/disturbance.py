@@ -1,7 +1,5 @@
 """Disturbed drives: noise and bursts on a policy's actions, so that data also show what follows unusual actions."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Any
 

@@ -1,7 +1,5 @@
 """How many drives a slot does side by side. Pure."""
 
-from __future__ import annotations
-
 import statistics
 from collections import deque
 

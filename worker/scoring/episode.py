@@ -1,7 +1,5 @@
 """The episode loop, which scoring, evaluating, recording, collecting and inspecting share."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What made an episode fail: an exception or the end of its process as a `Failure`. Pure."""
 
-from __future__ import annotations
-
 import errno
 import signal
 from contextlib import suppress

@@ -6,8 +6,6 @@ rounding shows in the last bits of nearly any sum of products. It remains a samp
 A host whose second probe computes other bits than its first one has the class `NON_DETERMINISTIC`.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Mapping
 from typing import Any

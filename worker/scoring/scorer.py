@@ -1,7 +1,5 @@
 """Scoring jobs in a slot, with an environment and a policy that are made once."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A policy whose steps somebody watches; the episode stays the same."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any

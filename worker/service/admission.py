@@ -1,7 +1,5 @@
 """Joining a run: the hello request and its answer."""
 
-from __future__ import annotations
-
 import json
 import math
 import random

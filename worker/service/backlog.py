@@ -3,8 +3,6 @@
 Batches may arrive twice, late or out of order, and anybody on the network can send some.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections import OrderedDict
 from collections.abc import Collection

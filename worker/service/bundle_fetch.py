@@ -4,8 +4,6 @@ Anybody on the network can answer. So all parts of a download come from one sour
 hash is used again only if nobody else answers.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import random

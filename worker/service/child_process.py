@@ -1,7 +1,5 @@
 """A scoring child process as its parent handles it."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Settings of a worker process."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from dreamfleet.common.cli.config import option

@@ -4,8 +4,6 @@ Frames have the lowest priority and are dropped where a link is busy, so no job,
 viewer. The expensive work, decoding and dreaming, is done by the viewer.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any

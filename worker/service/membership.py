@@ -4,8 +4,6 @@ A coordinator forgets a worker whose liveliness token vanishes. A cut connection
 the other, and neither side can reliably notify the other afterwards.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

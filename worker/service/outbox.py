@@ -3,8 +3,6 @@
 Pure: it takes the time as an argument and returns what to send.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections import OrderedDict
 from collections.abc import Iterable

@@ -4,8 +4,6 @@ One thread owns everything and reads one queue; Zenoh's callbacks and the slots'
 in pure classes (`Membership`, `Backlog`, `Outbox`, `UploadQueue`). This module gives them times and events.
 """
 
-from __future__ import annotations
-
 import logging
 import queue
 import random

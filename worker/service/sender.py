@@ -1,7 +1,5 @@
 """Messages from a worker to the coordinator of its run."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from typing import Any

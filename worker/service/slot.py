@@ -1,7 +1,5 @@
 """A scoring slot: it keeps one child process running, so that a crashed simulator costs one job and not the worker."""
 
-from __future__ import annotations
-
 import logging
 import math
 import queue

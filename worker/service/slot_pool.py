@@ -1,7 +1,5 @@
 """All scoring slots of a worker."""
 
-from __future__ import annotations
-
 import logging
 import math
 import queue

@@ -1,7 +1,5 @@
 """What a worker says of itself: why it leaves, what it waits for, and whole commands with the flags that were given."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from itertools import takewhile
 

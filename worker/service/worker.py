@@ -1,7 +1,5 @@
 """A worker process: it connects, joins a run, serves it, and leaves; with `--any`, it serves several side by side."""
 
-from __future__ import annotations
-
 import logging
 import queue
 import random

@@ -1,7 +1,5 @@
 """Optional: a task that scores candidates in batches, as the dream does, and batches that can be watched."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 

@@ -1,7 +1,5 @@
 """Closing an environment: its episodes are over, so a fault of its `close` is no longer theirs."""
 
-from __future__ import annotations
-
 import logging
 import signal
 import threading

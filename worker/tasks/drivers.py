@@ -3,8 +3,6 @@
 They draw each action evenly: the number of each of its choices, or a number between the bounds of each component.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

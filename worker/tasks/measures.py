@@ -4,8 +4,6 @@ docs/how-to/quality-diversity.md lists them. Components of actions have the name
 action1, ...; of a numbered action the measure is the share of steps that took it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Policies without a world model: of a controller on flat observations, of a driver, and of a choice that is held."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, Protocol

@@ -4,8 +4,6 @@ A recordable task chains them in the order in which they stand here. What is lef
 `(size, size, 3)` and takes float32 actions `(A,)`.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

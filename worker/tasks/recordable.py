@@ -1,7 +1,5 @@
 """Optional: a task in whose world rollouts are recorded and world models are trained (docs/reference/worlds.md)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable

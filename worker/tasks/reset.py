@@ -1,7 +1,5 @@
 """Resetting an environment with a seed that may be too long for it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium

@@ -1,7 +1,5 @@
 """Optional: a policy that acts for several episodes at once."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 

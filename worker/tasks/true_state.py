@@ -1,7 +1,5 @@
 """Optional: a task whose worlds report their true state."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 

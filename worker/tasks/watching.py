@@ -1,7 +1,5 @@
 """Watching episodes while they are scored: what an observer gets of a step."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 

@@ -1,7 +1,5 @@
 """What the rest of the system knows of a world."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Checkpoints as safetensors: weights, Adam's moments, and how far training has come. No pickle."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress

@@ -1,7 +1,5 @@
 """Flags, and keys of `--set`, that override a preset's training and layers, one per field."""
 
-from __future__ import annotations
-
 import argparse
 import types
 from collections.abc import Collection, Mapping, Sequence

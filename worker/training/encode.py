@@ -4,8 +4,6 @@ Each drive is also encoded mirrored, if mirrored pictures can occur in a drive. 
 so the latents equal those that controllers will see, to the bit.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Measure an MDN-RNN's predictions: one step ahead, and after steps of dreaming under recorded actions."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

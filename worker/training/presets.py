@@ -1,7 +1,5 @@
 """The presets of whole trainings: amounts of data and updates, and the models' layers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Annotated, Any, get_type_hints
 

@@ -1,7 +1,5 @@
 """Configure a process before torch is loaded: threads and heap; and run torch on one thread."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Train the MDN-RNN on encoded rollouts."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Train the VAE on recorded pictures."""
 
-from __future__ import annotations
-
 import base64
 import logging
 from collections.abc import Callable, Sequence

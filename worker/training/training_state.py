@@ -1,7 +1,5 @@
 """The state of a training: progress, optimiser, checkpoints and loss curve, early stopping; and its device."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys

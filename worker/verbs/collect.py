@@ -1,7 +1,5 @@
 """`dreamfleet collect`: drives as training data: random ones, controllers' or a run's."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`dreamfleet encode`: pictures to latents."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

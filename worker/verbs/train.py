@@ -1,7 +1,5 @@
 """`dreamfleet train MODEL`: train a part of a world model, its VAE or its MDN-RNN, on a data set."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

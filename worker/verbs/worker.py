@@ -1,7 +1,5 @@
 """`dreamfleet worker`: score for a run, from any host."""
 
-from __future__ import annotations
-
 import argparse
 
 from dreamfleet.common.cli.config import add_flags, load

@@ -4,8 +4,6 @@ It is kept in the last columns of the recurrent state. So it moves with the stat
 dream begins at a step of a drive.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

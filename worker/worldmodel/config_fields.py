@@ -1,7 +1,5 @@
 """Fields of a model's configuration: the bounds of its sizes, and factors that weight the parts of a loss."""
 
-from __future__ import annotations
-
 from dataclasses import field
 from typing import Any
 

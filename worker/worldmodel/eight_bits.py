@@ -5,8 +5,6 @@ form in sixteen bits, then never overflow. Where a sum becomes a single-precisio
 product is exact: processors that add the bias in the same instruction then round as those that do not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -4,8 +4,6 @@ They are written by hand rather than traced, because a row's bits must not depen
 initializers, and no node gathers, loops or reshapes by a traced batch size.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any

@@ -1,7 +1,5 @@
 """Run the frozen world model in ONNX Runtime: on one thread, and a row's bits do not depend on its batch."""
 
-from __future__ import annotations
-
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np

@@ -5,8 +5,6 @@ three forms, and whether the episode ends (the paper's Doom). The additive atten
 one of miketynes/AttentiveWorldModels; its code takes the softmax over the batch on a state that stays zero.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

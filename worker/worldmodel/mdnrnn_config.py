@@ -1,7 +1,5 @@
 """The configuration of an MDN-RNN, in a module of its own that needs no torch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 

@@ -1,7 +1,5 @@
 """The MDN-RNN's step as ONNX nodes, for the policy's and the dream's graph, and the export of the dream."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

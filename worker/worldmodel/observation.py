@@ -1,7 +1,5 @@
 """The observations of agents trained outside dreamfleet, equal in the dream and in reality."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Build ONNX graphs node by node."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A world model's latent and recurrent state along a drive, under any driver."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

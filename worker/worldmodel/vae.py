@@ -1,7 +1,5 @@
 """The variational autoencoder of Ha & Schmidhuber 2018 (appendix A.1) and of its successors."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

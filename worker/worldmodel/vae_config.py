@@ -1,7 +1,5 @@
 """The configuration of a VAE, in a module of its own that needs no torch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal, NamedTuple

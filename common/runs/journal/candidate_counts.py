@@ -1,7 +1,5 @@
 """The episodes that each candidate's fitness is the mean of, with their effort."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite

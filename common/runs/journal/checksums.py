@@ -3,8 +3,6 @@
 A checksum is written once nothing of what it covers changes any more. What is open has none, and is not compared.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterable
 from typing import Any

@@ -1,7 +1,5 @@
 """Whether a journal is what was written: SQLite's own check, checksums, and sums of what belongs together."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from math import isclose
 from statistics import fmean

@@ -1,7 +1,5 @@
 """The read-only connection to a run's journal, and its larger queries."""
 
-from __future__ import annotations
-
 import os
 import sqlite3
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """The journal's tables. A journal of another schema version is refused and left as it is."""
 
-from __future__ import annotations
-
 import sqlite3
 from contextlib import closing
 from functools import cache

@@ -1,7 +1,5 @@
 """Collect rollouts, one compressed `.npz` per episode: driven here as pure functions of (seed, number), or imported."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager

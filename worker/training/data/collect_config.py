@@ -1,7 +1,5 @@
 """The configuration of collecting, whose fields are flags: amounts and drivers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The folder of a data set: the preset, seed and world it was begun with, and errors of writing there."""
 
-from __future__ import annotations
-
 import errno
 import json
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """The recorded episodes of a data set, and their world. They are streamed: memory holds a few dozen, never all."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Steps of recorded drives: losses of the course, or deaths, and beginnings of dreams for a bundle."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

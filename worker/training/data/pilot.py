@@ -1,7 +1,5 @@
 """A controller that drives for a data set."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from dreamfleet.common.artifacts.actions import Continuous

@@ -1,7 +1,5 @@
 """Compute recorded states for a bundle: latents and recurrent states at steps of a folder's drives."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby

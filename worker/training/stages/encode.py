@@ -1,7 +1,5 @@
 """Encoding: the pictures of a data set's drives as latents of its VAE."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
