@@ -77,7 +77,7 @@ def make_request(args: argparse.Namespace) -> PipelineRequest:
         config = ("--config", str(args.config)) if getattr(args, "config", None) else ()  # its tables hold for stages
         return (*split_flags(f"--{name}-flags", getattr(args, f"{name}_flags"), "pipeline", RESERVED_FLAGS), *config)
 
-    def training(model: Model, config: TrainConfig) -> TrainRequest:
+    def training(model: Model, config: "TrainConfig") -> TrainRequest:
         # Updates, and those between checks on held-out drives, by scale: so there are as many checks at any scale.
         amounts = ("--updates", scale(config.updates), "--set", f"validate_every={scale(config.validate_every)}")
         words = ("--device", args.device, *amounts, *flags(model))
