@@ -140,7 +140,7 @@ def test_a_data_set_that_was_not_begun_by_collect_stays_without_a_preset(tmp_pat
 
 
 @pytest.mark.parametrize(
-    "content", ["", "[]", "{}", '{"preset": "paper"}', '{"preset": "dream", "task": ""}', "[" * 900]
+    "content", ["", "[]", "{}", '{"preset": "paper"}', '{"preset": "dream", "task": "car-racing"}', "[" * 900]
 )
 def test_a_damaged_preset_file_is_reported_in_a_line(tmp_path, content):
     (tmp_path / "preset.json").write_text(content)
