@@ -186,6 +186,40 @@ def test_reproduction_is_to_the_bit_on_equal_hosts_and_within_two_errors_elsewhe
     assert "tiny" in found.description
 
 
+FACTS = {
+    "controller": "ef" * 32, "task": "gym:Acrobot-v1", "options": '{"a": 1}', "world": "gym:Acrobot-v1",
+    "judge": "dodge", "bundle": "64" * 32, "threshold": 200.0, "marks": (1.0,),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fact", FACTS)
+@pytest.mark.parametrize("changes", [{}, ELSEWHERE])
+def test_a_record_that_states_another_controller_or_world_is_not_reproduced(fact, changes):
+    recorded = scored(100, 500, 900)
+    found = Reproduction(replace(recorded, **{fact: FACTS[fact]}), replace(recorded, **changes))
+    assert (found.is_reproduced, found.differing_facts) == (False, (fact,))
+    assert str(FACTS[fact]) in found.description
+
+
+def test_what_a_record_leaves_out_contradicts_nothing():
+    now = scored(100, 500, 900, options='{"a": 1}', threshold=900.0, marks=(800.0,))
+    found = Reproduction(scored(100, 500, 900), now)
+    assert (found.is_reproduced, found.differing_facts) == (True, ())
+
+
+@pytest.mark.parametrize(("was", "now", "holds"), [
+    ({}, {"finished": True, "speed": 50.0}, True), ({"finished": True}, {"finished": False}, False),
+    ({"finished": False}, {}, False), ({"speed": 50.0}, {"speed": 50.5}, False),
+    ({"braking": 0.0}, {"braking": 0.1}, False),
+])  # fmt: skip
+def test_every_recorded_figure_of_an_episode_must_be_equal_on_equal_hosts(was, now, holds):
+    recorded, repeated = (
+        replace(JUDGEMENT, drives=(DRIVES[0], EpisodeResult(10_001, 910.0, 500, **each))) for each in (was, now)
+    )
+    found = Reproduction(recorded, repeated)
+    assert (found.is_reproduced, found.differing_seeds) == (holds, () if holds else (10_001,))
+
+
 def test_a_report_of_another_world_names_its_judge_and_its_marks(tmp_path):
     report = scored(700, 800, threshold=750.0, judge="dodge", marks=(750.0,))
     (tmp_path / "report.json").write_text(report.to_json())

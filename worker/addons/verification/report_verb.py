@@ -84,6 +84,7 @@ def _row(found: Reproduction) -> dict[str, object]:
         "reproduced": found.is_reproduced,
         "same_host": found.same_fingerprint,
         "differing": found.differing_seeds,
+        "differing_facts": found.differing_facts,
         "mean": found.repeated.results.mean,
         "difference": difference,
     }

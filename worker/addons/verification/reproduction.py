@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import cached_property
+from itertools import starmap
 
-from dreamfleet.common.printable import format_number, plural
+from dreamfleet.common.printable import format_number, one_line, plural
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
+
+WHAT = "controller", "task", "options", "world", "judge", "bundle", "threshold", "marks"  # of a report: what was driven
 
 
 @dataclass(frozen=True)
 class Reproduction:
     """A recorded report, and a new one of the same controller on all or some of its seeds.
 
-    On a host of the recorded fingerprint every episode must be bit-identical. On other hosts the mean may differ by two
-    standard errors of the paired difference; a single episode must be bit-identical there too.
+    What the record states of controller and world must hold; what it leaves empty, it does not state. On a host of the
+    recorded fingerprint every episode must be bit-identical. On other hosts the mean may differ by two standard errors
+    of the paired difference; a single episode must be bit-identical there too.
     """
 
     recorded: EvaluationReport
@@ -34,9 +38,18 @@ class Reproduction:
         return self.recorded.fingerprint == self.repeated.fingerprint
 
     @property
+    def differing_facts(self) -> tuple[str, ...]:
+        """The fields of `WHAT` that the record states, and that are others now."""
+        was, now = ([getattr(each, name) for name in WHAT] for each in (self.recorded, self.repeated))
+        return tuple(name for name, one, other in zip(WHAT, was, now, strict=True) if _contradicts(one, other))
+
+    @property
     def differing_seeds(self) -> tuple[int, ...]:
-        """The seeds whose score or number of steps differs, or which fail now."""
-        differing = {one.seed for one, other in self.pairs if (one.score, one.steps) != (other.score, other.steps)}
+        """The seeds whose score, number of steps or another recorded figure differs, or which fail now."""
+        differing = {
+            one.seed for one, other in self.pairs
+            if any(starmap(_contradicts, zip(astuple(one), astuple(other), strict=True)))
+        }  # fmt: skip
         return tuple(sorted(differing | {each.seed for each in self.repeated.failed}))
 
     @property
@@ -47,6 +60,8 @@ class Reproduction:
     @property
     def is_reproduced(self) -> bool:
         """Whether the record is reproduced."""
+        if self.differing_facts:
+            return False
         return not self.differing_seeds or (
             not self.repeated.failed
             and not self.same_fingerprint
@@ -59,6 +74,10 @@ class Reproduction:
         """A text for display."""
         name, count, mean = self.recorded.name, len(self.pairs), self.repeated.results.mean
         failed = len(self.recorded.failed)
+        if self.differing_facts:
+            first = self.differing_facts[0]
+            was, now = (one_line(str(getattr(each, first))) or "none" for each in (self.recorded, self.repeated))
+            return f"{name}: NOT reproduced: the report says {first} {was}, and it is {now}"
         if self.repeated.failed:
             now = self.repeated.results.failure_text
             return f"{name}: NOT reproduced: {now}; all had a score when they were recorded"
@@ -80,3 +99,8 @@ class Reproduction:
             return f"{name}: NOT reproduced: {was} on one seed; without equal bits a comparison takes 2 seeds; {hosts}"
         verdict = "reproduced" if self.is_reproduced else "NOT reproduced"
         return f"{name}: {verdict}: mean {format_number(mean)}, {self.difference.description}; {hosts}"
+
+
+def _contradicts(recorded: object, repeated: object) -> bool:
+    """Whether a figure or fact of a record is another one now; it states nothing where it is empty."""
+    return recorded not in (None, "", ()) and recorded != repeated
