@@ -4,8 +4,6 @@ import os
 import subprocess
 import sys
 
-import pytest
-
 from dreamfleet.common.host.processes import VerbProcess
 from dreamfleet.common.host.reports import ADDRESS
 from tests.support import tasks
@@ -44,12 +42,3 @@ def test_a_child_dies_with_a_killed_parent():
         child = os.pidfd_open(int(parent.stdout.readline()))
         parent.kill()
     assert ends(child)
-
-
-@pytest.mark.slow
-def test_the_last_line_of_a_killed_child_says_so(processes):
-    child = processes.start("worker", "--connect", "tcp/127.0.0.1:1")
-    said = child.wait_for_event("no coordinator")["message"]
-    child.popen.kill()
-    child.finish()
-    assert " 9" in child.last_line().removesuffix(said)

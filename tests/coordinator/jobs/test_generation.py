@@ -17,15 +17,6 @@ DREAM = replace(SPEC, task="dream")
 VECTORS = [vector_bytes(np.full(5, value)) for value in (0.0, 1.0, 2.0)]
 
 
-def test_every_candidate_drives_every_seed():
-    generation = Generation(4, SPEC, VECTORS, (100, 200))
-    jobs = [work.job for work in generation.missing]
-    assert [(job.candidate, job.episode, job.seeds) for job in jobs] == [
-        (candidate, episode, (seed,)) for candidate in range(3) for episode, seed in enumerate((100, 200))
-    ]
-    assert len({job.digest for job in jobs}) == generation.total == 6
-
-
 def test_of_a_dreams_episodes_the_first_are_driven_and_say_so():
     generation = Generation(0, DREAM, VECTORS, (100, 200, 300), driven=1)
     jobs = [work.job for work in generation.missing]

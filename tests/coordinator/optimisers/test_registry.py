@@ -19,10 +19,6 @@ def build(optimiser, *options, covariance="diagonal", dimension=12, population=8
     return Evolution(optimiser, Search(np.zeros(dimension), population, 0.1, 3, parse_options([*options, *own])))
 
 
-def test_what_ships_is_registered():
-    assert set(registry.known_optimisers()) >= {"cma", "cmaes-lra", "cmaes-sep", "openes", "pepg", "snes", "xnes"}
-
-
 def test_without_docstrings_pycma_is_refused_as_a_wrong_command():
     words = [sys.executable, "-OO", "-m", "dreamfleet", "coordinator", "--run", "x", "--task", "gym:CartPole-v1"]
     done = subprocess.run(words, capture_output=True, text=True, check=False)

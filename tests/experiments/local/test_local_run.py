@@ -48,5 +48,5 @@ def test_a_run_whose_workers_all_failed_is_not_waited_for(tmp_path):
         assert first.wait(DEADLINE)
         run.check_some_worker()  # the other one may go on
         second.kill()
-        with pytest.raises(DreamfleetError, match="9"):
+        with pytest.raises(DreamfleetError, match=r"\b9\b"):
             run.wait(never_stop, run.check_some_worker)
