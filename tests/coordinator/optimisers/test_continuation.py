@@ -1,4 +1,8 @@
-"""Every optimiser that ships, and one of a third party, against the same contract. Tests api.py and pycma_state.py."""
+"""Every optimiser that ships, and one of a third party, against the same contract; old and damaged states.
+Tests api.py, checkpoint.py and pycma_state.py."""
+
+from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +13,7 @@ from dreamfleet.coordinator.optimisers.api import Search
 from dreamfleet.coordinator.optimisers.checkpoint import Checkpoint
 from dreamfleet.coordinator.optimisers.evolution import Evolution
 from dreamfleet.coordinator.optimisers.registry import known_optimisers
+from tests.support.mutations import Watched, archives
 
 OWN = "tests.support.optimisers:ParentsAndChildren"
 OPTIMISERS = [(name, "diagonal") for name in (*known_optimisers(), OWN)] + [("cma", "full"), ("cma-me", "full")]
@@ -168,3 +173,36 @@ def test_a_state_of_another_version_is_refused_with_the_remedy(optimiser, covari
 def test_a_state_of_another_optimiser_is_refused():
     with pytest.raises(JournalError, match=r"'cmaes-sep'.* 'cma'"):
         Evolution(*config("cma")).restore(Evolution(*config("cmaes-sep")).state().packed())
+
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+STATE = "pycma-state-of-0.1.npz"
+
+
+def test_a_state_of_the_first_version_continues_to_the_bit():
+    state = (GOLDEN / STATE).read_bytes()
+    head = Checkpoint.unpack(state).head
+    assert (head.name, head.requirement, head.sigma) == ("cma", "cma==4.5.0", 0.13321928916395698)
+    evolution = Evolution("cma", Search(np.zeros(3), 4, 0.1, seed=7))
+    evolution.restore(state)
+    assert np.array_equal(evolution.ask(), np.load(GOLDEN / "pycma-population-of-0.1.npy"))
+
+
+def test_a_state_that_says_nothing_of_its_origin_is_refused():
+    buffer = BytesIO()
+    np.savez(buffer, numbers=np.arange(5))
+    with pytest.raises(JournalError):
+        Checkpoint.unpack(buffer.getvalue())
+
+
+@pytest.mark.parametrize("covariance", ["diagonal", "full"])
+def test_a_damaged_state_is_restored_or_is_one_line(covariance):
+    search, count = Search(np.zeros(4), 6, 0.5, 1, {"covariance": covariance}), 50
+    evolution = Evolution("cma", search)
+    for _ in range(3):
+        evolution.tell((evolution.ask() ** 2).sum(axis=1))
+    watched, restored = Watched(), 0
+    for data in archives(evolution.state().packed(), count, seed=8):
+        restored += watched.read(JournalError, Evolution("cma", search).restore, data)
+    watched.check()
+    assert 0 < restored < count

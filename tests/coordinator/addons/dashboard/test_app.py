@@ -1,6 +1,6 @@
-"""The routes of the page and their access control. Tests assets.py, guard.py, coordinator/addons/web/documents.py,
-coordinator/addons/web/address.py, coordinator/addons/web/guard.py and coordinator/addons/web/server.py.
-Tests coordinator/addons/dashboard/config.py."""
+"""The routes of the page, their access control, and live views without a browser. Tests assets.py, config.py, guard.py,
+view_processes.py and coordinator/addons/web/address.py, coordinator/addons/web/documents.py,
+coordinator/addons/web/guard.py and coordinator/addons/web/server.py."""
 
 import asyncio
 import json
@@ -21,7 +21,7 @@ from dreamfleet.coordinator.addons.dashboard.assets import Assets
 from dreamfleet.coordinator.addons.dashboard.config import DashboardConfig
 from dreamfleet.coordinator.addons.dashboard.feed import Feed
 from dreamfleet.coordinator.addons.dashboard.live_runs import Watcher
-from dreamfleet.coordinator.addons.dashboard.view_processes import ViewProcesses
+from dreamfleet.coordinator.addons.dashboard.view_processes import ViewProcesses, ViewTarget
 from tests.support.journals import change_journal
 from tests.support.processes import DEADLINE
 
@@ -287,3 +287,33 @@ def test_an_address_can_be_opened_and_its_repr_hides_the_token():
     assert TOKEN not in repr(DashboardConfig(token=TOKEN))
     assert DashboardConfig().url(8420) == "http://127.0.0.1:8420"
     assert DashboardConfig(host="::1").url(1) == "http://[::1]:1"
+
+
+PLACE = ("--connect", "tcp/127.0.0.1:1")
+
+
+@pytest.mark.parametrize(("allowed", "target"), [(1, ViewTarget("night", "generation", "3")), (0, ViewTarget("night"))])
+def test_a_view_that_shows_nothing_ends_with_a_notice(tmp_path, allowed, target):
+    views = ViewProcesses(PLACE, tmp_path, allowed)
+
+    async def watch():
+        said = [each async for each in views.events(target)]
+        await views.close()
+        return json.loads(said[-1].split(b"data: ")[1])
+
+    notice = asyncio.run(watch())
+    assert notice["state"] == "ended"
+    assert ("'night'" in notice["text"]) == bool(allowed), "the last message of its process"
+
+
+@pytest.mark.parametrize(
+    ("asked", "flags"),
+    [
+        ({"run": "night"}, ["--run=night", *PLACE]),
+        ({"run": "night", "best": ""}, ["--run=night", *PLACE, "--best"]),
+        ({"run": "night", "worker": "a/0a1b2c3d"}, ["--run=night", *PLACE, "--worker=a/0a1b2c3d"]),
+        ({"run": "night", "generation": "7"}, ["--controller=night", "--generation=7", "--runs-dir=runs"]),
+    ],
+)
+def test_a_target_becomes_flags_without_injection(asked, flags):
+    assert ViewTarget.of(asked).flags(PLACE, Path("runs")) == flags

@@ -1,5 +1,5 @@
-"""A receipt says what is true of its run, and its commands run as they are printed.
-Tests coordinator/addons/runs/analysis_verb.py."""
+"""A receipt and `runs show` say what is true of a run, and a receipt's commands run as they are printed.
+Tests run_details.py, verb.py and coordinator/addons/runs/analysis_verb.py."""
 
 import json
 import re
@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 
 from dreamfleet.common.artifacts.controller import Controller
+from dreamfleet.common.client.equal_fitness import ENOUGH, EqualFitness
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC
 from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.records import StageSettings
@@ -18,8 +19,11 @@ from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.common.runs.run_provenance import RECEIPT, RunProvenance
 from dreamfleet.common.runs.seeds import training_seeds
 from dreamfleet.common.schema.validation import to_plain
+from dreamfleet.coordinator.addons.runs import run_details
+from dreamfleet.coordinator.addons.runs.plot import fitness_figure
 from tests.support.journals import change_journal, change_settings
 from tests.support.processes import call_here, printed
+from tests.support.tables import cells
 
 
 @pytest.fixture
@@ -118,3 +122,30 @@ def test_the_commands_of_a_run_in_an_environment_of_a_module_run_as_printed(proc
     for words in (commands[0], commands[2]):
         code, _, err = processes.call(*words)
         assert code == 0, err
+
+
+def shown():
+    return dict(row for line in printed("runs", "show", "reality").splitlines() if len(row := cells(line)) == 2)
+
+
+def test_settings_that_do_not_apply_are_left_out_and_json_has_all(runs):
+    few = shown().keys()
+    assert {"population", "sigma0", "seed", "task.horizon"} < few
+    assert not {"task.recorded", "task.driven", "task.end", "driven", "task.temperature"} & few
+    every = json.loads(printed("runs", "show", "reality", "--json"))["settings"]
+    assert {"recorded", "driven", "end", "temperature"} < every["task"].keys()
+
+
+def test_a_limit_of_the_environment_below_the_horizon_is_said(runs):
+    change_journal(runs / "reality", "INSERT INTO run (key, value) VALUES ('episode_limit', '3')")
+    assert re.search(r"\b3\b", shown()["task.horizon"])
+    with RunFolder(runs / "reality") as run:
+        assert re.search(r"\b3\b", fitness_figure(run).axes[0].get_ylabel())
+
+
+def test_generations_of_one_fitness_are_warned_of(runs, monkeypatch):
+    assert "warning" not in shown()
+    monkeypatch.setattr(
+        run_details, "EqualFitness", lambda rows: EqualFitness([replace(rows[0], worst=rows[0].best)] * ENOUGH)
+    )
+    assert "--sigma0" in shown()["warning"]
