@@ -186,6 +186,20 @@ def test_reproduction_is_to_the_bit_on_equal_hosts_and_within_two_errors_elsewhe
     assert "tiny" in found.description
 
 
+@pytest.mark.parametrize(("was", "now", "decided", "holds"), [
+    ((100, 180), (500, 500), False, False), ((0, 700), (500, 500), False, False), ((0, 1000), (500, 500), False, False),
+    ((500, 480), (500.001, 479.9995), True, True),  # the difference is small
+    ((100, 101), (500, 500.9), True, False),
+    ((100, 500, 900, 300), (900, 300, 100, 510), False, False),
+    (tuple(range(100)), tuple(reversed(range(100))), True, True),
+    ((500,) * 100, (*(500,) * 99, 499), True, True),
+])  # fmt: skip
+def test_on_another_host_too_few_seeds_decide_nothing(was, now, decided, holds):
+    found = Reproduction(scored(*was), scored(*now, **ELSEWHERE))
+    assert (found.is_decided, found.is_reproduced) == (decided, holds)
+    assert found.description.startswith("tiny: not decided: ") is not decided
+
+
 FACTS = {
     "controller": "ef" * 32, "task": "gym:Acrobot-v1", "options": '{"a": 1}', "world": "gym:Acrobot-v1",
     "judge": "dodge", "bundle": "64" * 32, "threshold": 200.0, "marks": (1.0,),

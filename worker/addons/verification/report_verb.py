@@ -37,7 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check each report; exit 1 if a score differs."""
+    """Check each report; exit 1 unless all are reproduced."""
     if args.jobs < 1 or (args.episodes is not None and args.episodes < 1):
         raise UsageError("--episodes and --jobs must be at least 1")
     recorded = [read_evaluation_report(each) for each in args.reports]
@@ -82,6 +82,7 @@ def _row(found: Reproduction) -> dict[str, object]:
     return {
         "name": found.recorded.name,
         "reproduced": found.is_reproduced,
+        "decided": found.is_decided,
         "same_host": found.same_fingerprint,
         "differing": found.differing_seeds,
         "differing_facts": found.differing_facts,

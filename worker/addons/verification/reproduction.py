@@ -20,7 +20,7 @@ class Reproduction:
 
     What the record states of controller and world must hold; what it leaves empty, it does not state. On a host of the
     recorded fingerprint every episode must be bit-identical. On other hosts the mean may differ by two standard errors
-    of the paired difference; a single episode must be bit-identical there too.
+    of the paired difference, on as many seeds as `is_decided` needs; a single episode must be bit-identical there too.
     """
 
     recorded: EvaluationReport
@@ -55,17 +55,33 @@ class Reproduction:
     @property
     def difference(self) -> PairedDifference:
         """The new scores minus the recorded ones; `UsageError` for a single seed."""
-        return PairedDifference.between(EpisodeResults(tuple(one for one, _ in self.pairs)), self.repeated.results)
+        return PairedDifference.between(self._compared, self.repeated.results)
+
+    @property
+    def _compared(self) -> EpisodeResults:
+        return EpisodeResults(tuple(one for one, _ in self.pairs))
+
+    @property
+    def is_decided(self) -> bool:
+        """Whether bits decide, or the seeds: they differ significantly, or would by the scores' standard deviation."""
+        if self.same_fingerprint or not self.differing_seeds:
+            return True
+        if len(self.pairs) < 2:
+            return False
+        found, deviations = self.difference, (self._compared.std, self.repeated.results.std)
+        return found.is_significant or found.critical_value * found.error <= max(each or 0.0 for each in deviations)
 
     @property
     def is_reproduced(self) -> bool:
         """Whether the record is reproduced."""
         if self.differing_facts:
             return False
-        return not self.differing_seeds or (
+        if not self.differing_seeds:
+            return True
+        return (
             not self.repeated.failed
             and not self.same_fingerprint
-            and len(self.pairs) > 1
+            and self.is_decided
             and not self.difference.is_significant
         )
 
@@ -97,6 +113,9 @@ class Reproduction:
         if count < 2:
             was = f"{format_number(mean)} instead of {format_number(self.pairs[0][0].score)}"
             return f"{name}: NOT reproduced: {was} on one seed; without equal bits a comparison takes 2 seeds; {hosts}"
+        if not self.is_decided:
+            said = f"mean {format_number(mean)}, {self.difference.description}"
+            return f"{name}: not decided: {said}; too few seeds to tell: compare more; {hosts}"
         verdict = "reproduced" if self.is_reproduced else "NOT reproduced"
         return f"{name}: {verdict}: mean {format_number(mean)}, {self.difference.description}; {hosts}"
 
