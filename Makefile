@@ -36,8 +36,7 @@ test-newest:  ## a short part of the tests, those without torch, on the newest P
 SHORT := tests/common/files tests/common/host tests/common/protocol tests/common/schema tests/common/cli/test_config.py \
   tests/coordinator/settings tests/coordinator/storage tests/coordinator/run tests/experiments/test_minimise.py \
   tests/worker/service tests/worker/scoring tests/test_structure.py
-WITHOUT_TORCH := --ignore tests/worker/scoring/test_other_processors.py \
-  --deselect tests/worker/service/test_slot_pool.py::test_a_torch_device_that_is_not_there_ends_the_worker_at_once
+WITHOUT_TORCH := --deselect tests/worker/service/test_slot_pool.py::test_a_torch_device_that_is_not_there_ends_the_worker_at_once
 
 short: $(VENV)/.short  # of `test-newest`
 	$(BIN)/pytest -m "not slow and not long" --numprocesses 3 --dist worksteal $(SHORT) $(WITHOUT_TORCH) $(ARGS)
@@ -94,8 +93,8 @@ simulate: $(VENV)/.dev  ## SCHEDULES seeded schedules of faults against the pure
 mutants: $(VENV)/.dev  ## COUNT small faults planted in the engine, drawn by SEED: which do its tests notice? REPLAY=FILE compares
 	$(BIN)/python -m tests.mutation --count $(or $(COUNT),300) --seed $(or $(SEED),1) $(if $(REPLAY),--replay $(REPLAY)) $(ARGS)
 
-weekend: $(VENV)/.dev  ## about MINUTES of a run that nobody watches, under outages, kills, clock steps and a full disk
-	$(BIN)/python -m tests.chaos.weekend --minutes $(or $(MINUTES),60) --seed $(or $(SEED),1) $(ARGS)
+weekend: $(VENV)/.dev  ## a run that nobody watches, whose episodes fail, under FAULTS outages, kills, clock steps and full disks
+	$(BIN)/python -m tests.chaos.chaos --stage failing --faults $(or $(FAULTS),100) --seed $(or $(SEED),1) $(ARGS)
 
 chaos: $(VENV)/.dev  ## a fleet under FAULTS seeded faults gives the bits of one that nobody disturbs
 	$(BIN)/python -m tests.chaos.chaos --faults $(or $(FAULTS),200) --seed $(or $(SEED),7) $(ARGS)

@@ -1,7 +1,7 @@
 """The core's tests, which import no add-on and have no mark `add_on`, in a copy of this tree without add-ons.
 
-`make core`, in the environment that `make test` made. `tests/end_to_end/test_without_addons.py` runs a coordinator and
-a worker without them.
+`make core`, in the environment that `make test` made. `tests/end_to_end/test_run.py` runs a coordinator and a worker
+without them.
 """
 
 from __future__ import annotations

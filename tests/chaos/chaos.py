@@ -1,10 +1,12 @@
 """A real fleet whose parts are killed, stopped, cut off and restarted, and one that nobody disturbs: the same bits?
 
     make chaos FAULTS=1000 SEED=7
+    make weekend FAULTS=100
 
-Faults come from the seed, each after a number of accepted results more than the one before; the last quarter strikes a
-task whose slots score 256 jobs together. Prints one line of JSON: for each task whether every fitness, vector and the
-mean are equal, jobs lost, and the share of environment steps that did not count.
+The second has candidates that fail, long outages and clock steps too, as a weekend that nobody watches. Faults come
+from the seed, each after a number of accepted results more than the one before; the last quarter strikes a task whose
+slots score 256 jobs together. Prints one line of JSON: for each task whether every fitness, vector and the mean are
+equal, jobs lost, and the share of environment steps that did not count.
 """
 
 import argparse
@@ -27,8 +29,9 @@ from tests.support.bundles import write_random_bundle
 from tests.support.disks import small_disk
 from tests.support.hosts import new_host
 from tests.support.processes import processes_in
+from tests.support.wall_clock import WallClock
 
-CALM = 120.0  # seconds without a new result that mean a hung run
+CALM = 300.0  # seconds without a new result that mean a hung run
 RUNS_DISK, CACHE_DISK = 600, 80  # megabytes
 
 
@@ -39,6 +42,7 @@ class Stage:
     name: str
     task: str
     jobs_a_fault: int
+    settings: tuple = ()
 
     def generations(self, faults):
         """That so many faults need."""
@@ -46,7 +50,8 @@ class Stage:
 
 
 NARROW = Stage("narrow", tasks.COUNTED, 50)
-WIDE = Stage("wide", tasks.Wide.name, 500)  # a slot that is killed loses twenty jobs
+FAILING = Stage("failing", "gym:tests.support.weekend_world:Weekend-v0", 100, ("--on-failure", "worst"))
+WIDE = Stage("wide", f"{tasks.MODULE}:Wide", 500)  # a slot that is killed loses twenty jobs
 
 
 def drive(processes, bundle, stage, generations, faults, seed, kinds):
@@ -55,7 +60,10 @@ def drive(processes, bundle, stage, generations, faults, seed, kinds):
         host = stack.enter_context(new_host())
         runs = stack.enter_context(small_disk(processes.runs, RUNS_DISK))
         cache = stack.enter_context(small_disk(processes.cache, CACHE_DISK))
-        fleet = Fleet(processes, bundle, generations, seed, stage.task, host, runs, cache)
+        clock = WallClock(processes.folder / "clock") if stage is FAILING and WallClock.possible() else None
+        model = "none" if stage is FAILING else bundle
+        fleet = Fleet(processes, model, generations, seed, stage.task, *stage.settings, host=host, runs=runs,
+                      cache=cache, clock=clock)  # fmt: skip
         stack.callback(processes.end)  # before the disks go
         happened = Counter(dict.fromkeys(kinds, 0))
         _drive(fleet, processes, stage, faults, happened)
@@ -91,7 +99,9 @@ def outcome(processes, generations):
     shutil.copytree(processes.runs, processes.folder / "runs-as-they-ended")  # their disk goes
     whole = same_bits.outcome(processes, "run")
     with open_run(processes.runs, "run") as run:
-        lost = generations * POPULATION * EPISODES - sum(map(len, whole.episodes))
+        scored = zip(whole.episodes, whole.fitness, strict=True)
+        lost = sum(EPISODES - len(episodes) for episodes, fitness in scored if fitness is not None)
+        lost += generations * POPULATION - len(whole.fitness)
         return whole._asdict(), lost, run.result_count()
 
 
@@ -118,8 +128,8 @@ def compare(folder, faults, seed, stage=NARROW, kinds=tuple(KINDS)):
     for name in different:
         print(f"{stage.name}: {name} differ: {_first_difference(calm[name], chaos[name])}", file=sys.stderr)
     return {
-        "identical": not different, "lost": lost, "waste": round(1 - counted / made, 4), "faults": dict(happened),
-        "skipped": skipped, "jobs": jobs, "made": made, "seconds": round(seconds),
+        "identical": not different, "lost": lost, "waste": made and round(1 - counted / made, 4),
+        "faults": dict(happened), "skipped": skipped, "jobs": jobs, "made": made, "seconds": round(seconds),
     }  # fmt: skip
 
 
@@ -138,7 +148,10 @@ def main():
     parser.add_argument("--kinds", default=",".join(KINDS), help=f"of faults, with commas between: {', '.join(KINDS)}")
     parser.add_argument("--without", default="", help="kinds that are left out")
     parser.add_argument(
-        "--stage", choices=("narrow", "wide", "both"), default="both", help="slots of width 1, 256, both"
+        "--stage",
+        choices=("narrow", "wide", "both", "failing"),
+        default="both",
+        help="slots of width 1, 256, both, and episodes that fail",
     )
     parser.add_argument("--folder", type=Path, help="a new folder, which is kept")
     arguments = parser.parse_args()
@@ -148,10 +161,11 @@ def main():
     with ExitStack() as stack:
         folder = arguments.folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         folder.mkdir(parents=True, exist_ok=arguments.folder is None)
-        wide = {"narrow": 0, "wide": arguments.faults}.get(arguments.stage, arguments.faults // 4)
+        both = {NARROW: arguments.faults - arguments.faults // 4, WIDE: arguments.faults // 4}
+        alone = {stage.name: {stage: arguments.faults} for stage in (NARROW, WIDE, FAILING)}
         figures = {
             stage.name: compare(folder, count, arguments.seed, stage, kinds)
-            for stage, count in ((NARROW, arguments.faults - wide), (WIDE, wide)) if count
+            for stage, count in alone.get(arguments.stage, both).items() if count
         }  # fmt: skip
     print(json.dumps(figures))
     return 0 if all(each["identical"] and not each["lost"] for each in figures.values()) else 1

@@ -7,7 +7,8 @@ import signal
 import time
 from contextlib import suppress
 from itertools import count
-from pathlib import Path
+
+import psutil
 
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.runs.run_folder import open_run
@@ -21,11 +22,14 @@ EXCUSE = 12.0  # seconds after a fault that may end a process, in which its end 
 class Fleet:
     """A coordinator and workers, each behind a relay of its own; the last one on a host of its own where allowed.
 
-    `runs` and `cache` are the small disks under the runs' folder and the workers' cache, where there are any.
+    `runs` and `cache` are the small disks under the runs' folder and the workers' cache, and `clock` is the
+    coordinator's, where there are any.
     """
 
-    def __init__(self, processes, bundle, generations, seed, task, host=None, runs=None, cache=None):
-        self.processes, self.host, self.runs, self.cache = processes, host, runs, cache
+    def __init__(
+        self, processes, bundle, generations, seed, task, *settings, host=None, runs=None, cache=None, clock=None
+    ):  # fmt: skip
+        self.processes, self.host, self.runs, self.cache, self.clock = processes, host, runs, cache, clock
         self.random = random.Random(seed)
         self._task = task
         self._settings = (
@@ -33,20 +37,24 @@ class Fleet:
         )  # fmt: skip
         self._first = (
             "--bundle", bundle, "--task", task, "--population", POPULATION, "--episodes", EPISODES,
-            "--evaluate-every", 20, "--evaluation-episodes", 3,
+            "--evaluate-every", 20, "--evaluation-episodes", 3, *settings,
         )  # fmt: skip
         self._order = count()
         self._healing = []
         self._waiting = set()  # numbers of workers that are to be started again
         self._excused = {}  # until when the end of a worker, by number, or of the coordinator, -1, is no failure
         self._heard = 0  # lines of the coordinator that have been looked at
-        self.coordinator = processes.start("coordinator", "--run", "run", *self._settings, *self._first)
+        self.coordinator = self._coordinate("--run", "run", *self._first)
         self.coordinator.wait_until_serving()
         addresses = ["127.0.0.1"] * WORKERS
         if host:
             addresses[-1] = host.address
         self.relays = [Relay(processes.port, address) for address in addresses]
         self.workers = [self.new_worker(number) for number in range(WORKERS)]
+
+    def _coordinate(self, *words):
+        inside = self.clock.inside if self.clock else ()
+        return self.processes.start("coordinator", *words, *self._settings, inside=inside)
 
     def new_worker(self, number):
         inside = self.host.inside if self.host and number == WORKERS - 1 else ()
@@ -61,7 +69,7 @@ class Fleet:
         self._replace_later(number, away)
 
     def resume(self):
-        self.coordinator = self.processes.start("coordinator", "--resume", "run", *self._settings)
+        self.coordinator = self._coordinate("--resume", "run")
         self._heard = 0
 
     def kill_coordinator(self):
@@ -135,9 +143,8 @@ def kill(process):
 
 def children(process):
     """Process ids of a worker's slots."""
-    pid = process.popen.pid
-    with suppress(OSError):
-        return [int(each) for each in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    with suppress(psutil.NoSuchProcess):
+        return [each.pid for each in psutil.Process(process.popen.pid).children()]
     return []
 
 

@@ -76,6 +76,13 @@ def double_name(fleet, number):
     fleet.later(fleet.random.uniform(1, 4), kill, double)
 
 
+@kind(often=1)
+def leave(fleet, number):
+    """A worker is stopped in order: it finishes what it has."""
+    fleet.excuse(number)
+    fleet.workers[number].popen.terminate()
+
+
 @kind(often=2)
 def kill_coordinator(fleet, _number):
     fleet.kill_coordinator()
@@ -117,6 +124,14 @@ def hold(fleet, number):
     fleet.later(fleet.random.uniform(0.2, 4), fleet.relays[number].release)
 
 
+@kind(often=1, possible=lambda fleet: fleet.clock is not None)
+def outage(fleet, _number):
+    """All links, for longer than the coordinator waits for a silent worker."""
+    for relay in fleet.relays:
+        relay.hold()
+        fleet.later(30, relay.release)
+
+
 @kind(often=1)
 def late_link(fleet, number):
     fleet.relays[number].delay = fleet.random.choice([0.0, 0.02, 0.1])
@@ -133,6 +148,12 @@ def slow_link(fleet, number):
 def unplug(fleet, _number):
     fleet.host.unplug()
     fleet.later(fleet.random.uniform(0.2, 6), fleet.host.plug)
+
+
+@kind(often=1, possible=lambda fleet: fleet.clock is not None)
+def clock_step(fleet, _number):
+    """The coordinator's wall clock is set."""
+    fleet.clock.set(fleet.random.choice((-172_800, -3_600, 3_600, 86_400)))
 
 
 # Disks and files.

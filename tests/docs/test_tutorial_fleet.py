@@ -12,7 +12,6 @@ from contextlib import ExitStack, contextmanager
 import pytest
 
 from dreamfleet.common.host.processes import command
-from tests.docs.tutorial import WHOLE
 from tests.support.processes import DEADLINE, ROOT, environment
 
 PAGE = (ROOT / "docs" / "tutorials" / "fleet.md").read_text()
@@ -65,7 +64,7 @@ def on_page(text):
 @pytest.mark.slow
 @pytest.mark.wording
 @pytest.mark.needs_programs("ip")
-@pytest.mark.timeout(WHOLE)
+@pytest.mark.timeout(3 * DEADLINE)
 @pytest.mark.skipif(os.geteuid() != 0, reason="network namespaces need root")
 def test_its_commands_lead_through_two_losses(tmp_path, processes):
     with three_hosts(tmp_path) as hosts:

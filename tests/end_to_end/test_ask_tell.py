@@ -12,7 +12,7 @@ from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.protocol.batches import BatchError
 from tests.support import tasks
-from tests.support.batches import SIZE, begin, count_results, rows, scorer, vectors
+from tests.support.batches import SIZE, begin, count_results, scorer, vectors
 from tests.support.processes import call_here, until
 
 
@@ -84,10 +84,7 @@ def test_wrong_batches_are_refused_and_lose_nothing(fleet):
             search.submit(vectors(2, 1.0), seeds=[1], batch_id="kept")
         assert taken.value.refusal == "conflict"
         assert (search.find("kept").wait() == fitness).all()
-    with (
-        RemoteScorer(fleet.endpoint, "nobody", timeout=0.0) as lost,
-        pytest.raises(ConnectionFailedError),
-    ):
+    with RemoteScorer(fleet.endpoint, "nobody", timeout=0.0) as lost, pytest.raises(ConnectionFailedError):
         lost.submit(vectors(1))
 
 
@@ -123,21 +120,3 @@ def test_a_failed_candidate_has_no_fitness_and_an_error(processes, random_bundle
         assert any("is brittle" in (each.error or "") for each in found.values())
         again = search.score(vectors(16), seeds=[2, 3], batch_id="again")  # failures are remembered too
         assert (np.isnan(again) == np.isnan(fitness)).all()
-
-
-@pytest.mark.slow
-def test_a_batch_outlives_the_kill_of_its_coordinator(processes, random_bundle):
-    coordinator = begin(processes, random_bundle, task=tasks.SLOW_TOY)
-    processes.worker("--task", tasks.SLOW_TOY)
-    with scorer(processes) as search:
-        batch = search.submit(vectors(12), seeds=[1, 2], batch_id="mine")
-        later = search.submit(vectors(2, 5.0), seeds=[1], batch_id="later")
-        found = batch.results()
-        next(found)
-        coordinator.end()
-        processes.resume().wait_until_serving()
-        assert len([*found]) == 11
-        assert np.isfinite(later.wait()).all()
-        assert (search.score(vectors(12), seeds=[1, 2], batch_id="mine") == batch.wait()).all()
-    assert count_results(processes) == (26, 260)
-    assert rows(processes, "SELECT id, state FROM batch") == [("mine", "complete"), ("later", "complete")]

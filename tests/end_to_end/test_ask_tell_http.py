@@ -13,7 +13,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import urllib.error
 import urllib.request
 from contextlib import ExitStack
@@ -345,19 +344,3 @@ def test_a_secured_fleet_needs_an_operators_file(processes, access, endpoint, ra
     bridge = Bridge(processes, "--join", access.path("operator"))
     assert bridge.submit({"id": "a", "vectors": rows(2), "seeds": [1]}, run="safe")[0] == 201
     assert [*bridge.events("a", run="safe")][-1][1]["state"] == "complete"
-
-
-@pytest.mark.slow
-def test_many_callers_at_once(processes, bridge):
-    def search(name):
-        for turn in range(5):
-            assert bridge.submit({"id": f"{name}-{turn}", "vectors": rows(4, float(name)), "seeds": [1]})[0] == 201
-            assert [*bridge.events(f"{name}-{turn}")][-1][1]["state"] == "complete"
-
-    threads = [threading.Thread(target=search, args=(each,)) for each in range(4)]
-    for each in threads:
-        each.start()
-    for each in threads:
-        each.join()
-    assert bridge.ask("GET", "/v1/runs")[1]["runs"][0]["state"] in ("waiting for a batch", "running")
-    assert count_results(processes)[0] == 16

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL, ROLLOUTS
 from dreamfleet.coordinator.addons.runs import backup
+from tests.support import tasks
 from tests.support.processes import ROOT, call_here
-from tests.support.same_bits import GENERATIONS, SETTINGS, outcome
+from tests.support.same_bits import outcome
 
 FIXTURES = ROOT / "tests" / "fixtures"
-FLAGS = (*SETTINGS, "--evaluate-every", 0, "--collect-every", 1, "--collect-episodes", 1)
+GENERATIONS = 4
 
 
 def back_up(processes, to, name="test", call=call_here):
@@ -23,16 +23,17 @@ def back_up(processes, to, name="test", call=call_here):
 
 
 @pytest.mark.slow
-def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, tmp_path):
-    whole = processes.coordinator(*FLAGS, name="whole")
-    worker = processes.worker("--run", "whole")
+def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, small, random_bundle, tmp_path):
+    flags = (*small, "--generations", GENERATIONS, "--collect-every", 1, "--collect-episodes", 1)
+    whole = processes.coordinator(*flags, name="whole")
+    worker = processes.worker("--run", "whole", "--task", tasks.SLOW_TOY)
     assert whole.finish()[0] == 0
     worker.end()
 
     safe = tmp_path / "safe"
-    served = processes.coordinator(*FLAGS)
+    served = processes.coordinator(*flags)
     for generation in (0, 1):
-        worker = processes.worker("--run", "test")
+        worker = processes.worker("--run", "test", "--task", tasks.SLOW_TOY)
         served.wait_for_event("generation", number=generation)
         worker.end()  # the run goes no further while it is copied
         code, out, err = back_up(processes, safe)
@@ -41,7 +42,7 @@ def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, 
     served.popen.kill()
     shutil.rmtree(processes.runs / "test")
     assert [path.name for path in safe.iterdir()] == ["test"], "the earlier copy is gone"
-    assert (safe / "test" / BUNDLE).read_bytes() == find_bundle("tiny").path.read_bytes()
+    assert (safe / "test" / BUNDLE).read_bytes() == random_bundle.path.read_bytes()
     with open_run(safe, "test") as copy:
         assert 2 <= len(copy.history()) < GENERATIONS
         assert all(path.is_file() for path in copy.rollouts())
@@ -49,7 +50,7 @@ def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, 
     code, _, err = processes.call("runs", "backup", "test", "--runs-dir", safe, "--to", processes.runs)
     assert code == 0, err
     resumed = processes.resume()
-    processes.worker("--run", "test")
+    processes.worker("--run", "test", "--task", tasks.SLOW_TOY)
     assert resumed.finish()[0] == 0
     assert outcome(processes, "test") == outcome(processes, "whole")
     assert len(list((processes.runs / "test" / ROLLOUTS).iterdir())) == GENERATIONS

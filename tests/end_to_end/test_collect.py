@@ -3,17 +3,12 @@ Tests coordinator/jobs/rollout_collection.py."""
 
 import io
 import re
-import signal
 
 import numpy as np
 import pytest
 
-from dreamfleet.common.protocol import keys
-from dreamfleet.common.protocol.codec import decode
-from dreamfleet.common.protocol.messages import MAX_PART, UploadPart
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.seeds import collection_seed
-from dreamfleet.common.transport.session import Network, open_session
 from dreamfleet.worker.training.data.dataset import episode_paths, load_pictures
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -63,27 +58,6 @@ def test_the_drives_are_a_function_of_the_run_and_not_of_the_worker(processes, s
         assert len(drive["action"]) == len(drive["reward"]) == len(drive["picture"]) == 10
         with open_run(processes.runs, "one") as run:
             assert run.results(1, 0, "collect")[0].fitness == pytest.approx(drive["reward"].sum(), rel=1e-5)
-
-
-@pytest.mark.slow
-def test_a_coordinator_killed_in_mid_upload_asks_again(processes, settings):
-    whole = processes.coordinator(*settings, "--task", tasks.HEAVY, name="whole")
-    processes.worker("--run", "whole", "--task", tasks.HEAVY)
-    assert whole.finish()[0] == 0
-
-    first = processes.coordinator(*settings, "--task", tasks.HEAVY, name="test")
-    with open_session(Network(connect=(processes.endpoint,))) as session:
-        heard = session.declare_subscriber(keys.all_workers("upload", "test"))
-        processes.worker("--run", "test", "--task", tasks.HEAVY)
-        part = decode(UploadPart, heard.recv().payload.to_bytes())
-        assert part.total > 3 * MAX_PART
-        first.popen.send_signal(signal.SIGKILL)
-        first.popen.wait()
-    with open_run(processes.runs, "test") as run:
-        assert run.rollouts() == []
-    again = processes.resume("test", "--generations", GENERATIONS)
-    assert again.finish()[0] == 0
-    assert kept(processes, "test") == kept(processes, "whole")
 
 
 @pytest.mark.slow

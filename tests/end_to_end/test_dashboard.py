@@ -266,26 +266,6 @@ def test_five_thousand_generations_and_five_hundred_workers_are_painted_in_no_ti
 
 
 @pytest.mark.slow
-def test_another_coordinators_refusal_is_shown_and_ends_nothing(browser, processes):
-    strange = snapshot(3)
-    broken = dataclasses.replace(
-        strange, status=dataclasses.replace(strange.status, recent=(), generations=2**60, uptime=float("inf"))
-    )
-    with serving(processes.endpoint, snapshot(0)) as served, dashboard(processes) as started, \
-            tab(browser) as page:  # fmt: skip
-        page.goto(started.address)
-        page.wait_for_selector(".placeholder")
-        assert page.locator("main svg.main-svg").count() == 0, "no axes before the first generation"
-        served.snapshot = strange
-        drawn(page, "Generation 2")
-        served.snapshot = broken
-        wait(page, "lost")
-        served.snapshot = strange
-        wait(page, "running")
-        without_absence(page)
-
-
-@pytest.mark.slow
 def test_the_token_is_asked_for_and_opens_the_page(browser, processes):
     with dashboard(processes, "--host", "0.0.0.0", "--token", TOKEN) as started, tab(browser) as page:
         address = started.address.replace("0.0.0.0", "127.0.0.1")

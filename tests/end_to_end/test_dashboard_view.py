@@ -1,9 +1,6 @@
 """The page's live view in a real browser: a process for what is watched, while somebody watches."""
 
-import os
-import signal
-from pathlib import Path
-
+import psutil
 import pytest
 
 from tests.support import tasks
@@ -26,9 +23,7 @@ def run(processes, small):
 
 
 def children(process):
-    """The processes that it has started."""
-    listed = Path(f"/proc/{process.popen.pid}/task/{process.popen.pid}/children").read_text()
-    return [int(each) for each in listed.split()]
+    return psutil.Process(process.popen.pid).children()
 
 
 def say(page, text, part="view-text"):
@@ -67,7 +62,7 @@ def test_pictures_come_with_their_facts_while_somebody_sees_them(browser, proces
         other.goto(started.address)
         other.wait_for_selector(PICTURE)
         (only,) = children(started)
-        os.kill(only, signal.SIGKILL)
+        only.kill()
         for each in (page, other):
             say(each, "was ended by signal 9")
             each.click("[data-part=view-again]")

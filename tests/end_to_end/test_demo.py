@@ -8,6 +8,7 @@ import signal
 from dataclasses import replace
 from pathlib import Path
 
+import psutil
 import pytest
 
 from dreamfleet.common.artifacts.controller import Controller
@@ -16,7 +17,7 @@ from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.experiments.demo import PLANS, Demo, DemoConfig, median_drive, plan_runs
-from tests.support.processes import call_here
+from tests.support.processes import call_here, runs
 from tests.support.tables import cells
 
 
@@ -81,13 +82,6 @@ def test_it_dreams_drives_judges_plots_and_records(processes, random_bundle, mon
     assert "http://127.0.0.1:" in out
 
 
-def test_each_world_is_judged_on_as_many_episodes_as_its_scores_vary():
-    cars, game = DemoConfig(), DemoConfig(world="takecover")
-    assert (cars.plan.tracks, game.plan.tracks, DemoConfig(tracks=3).plan.tracks) == (16, 100, 3)
-    looks = [each.flags["evaluation-episodes"] for each in plan_runs(game, "demo", Path("runs"))]
-    assert looks == [50, 50]
-
-
 @pytest.mark.parametrize("name", ["shown-dream", "shown"])
 def test_a_run_of_its_name_is_refused_before_anything_begins(name, tmp_path, capsys):
     (tmp_path / name).mkdir()
@@ -107,13 +101,6 @@ def test_what_it_begins_is_of_no_other_fleet(monkeypatch):
     assert joins == [""]
 
 
-def _runs(pid):
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
 @pytest.mark.slow
 def test_stopped_without_a_page_it_had_none_leaves_nobody_and_says_how_to_go_on(processes, random_bundle):
     demo = processes.start(
@@ -122,13 +109,13 @@ def test_stopped_without_a_page_it_had_none_leaves_nobody_and_says_how_to_go_on(
     )  # fmt: skip
     while not ((status := processes.status()) and status["workers"]["present"]):  # the page would have come before
         assert demo.popen.poll() is None
-    started = Path(f"/proc/{demo.popen.pid}/task/{demo.popen.pid}/children").read_text().split()
-    words = [Path(f"/proc/{each}/cmdline").read_bytes().split(b"\0") for each in started]
+    started = psutil.Process(demo.popen.pid).children()
+    words = [each.cmdline() for each in started]
     demo.popen.send_signal(signal.SIGTERM)
     assert demo.finish()[0] == 130
     assert "--resume demo-dream" in demo.last_line()
-    assert not any(_runs(each) for each in started)
-    assert not any(b"dashboard" in each for each in words)
+    assert not any(runs(each.pid) for each in started)
+    assert not any("dashboard" in each for each in words)
 
 
 def test_a_name_that_no_run_can_have_makes_no_folder(tmp_path, monkeypatch):

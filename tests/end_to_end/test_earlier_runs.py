@@ -1,7 +1,8 @@
 """Runs that the version before this layout recorded: they open, replay and go on, to the bit on an equal host.
 
 `tests/fixtures` holds their journals, the controllers that they reported, their world model, and what the version that
-wrote them gave when it continued them.
+wrote them gave when it continued them. CarRacing computes what it did when it was the only world:
+`tests/support/first_world.py` says what is compared, and writes the fixture.
 """
 
 import json
@@ -12,6 +13,7 @@ import pytest
 
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.runs.run_folder import open_run
+from tests.support.first_world import GOLD, HOST, PARTS
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 CONTINUED = json.loads((FIXTURES / "continued.json").read_text())
@@ -56,3 +58,17 @@ def test_they_go_on_as_the_version_that_wrote_them_would(processes, runs, name):
     if not loosened:
         assert [[each.hex() for each in row] for row in fitness] == expected["fitness"]
         assert evaluations == expected["evaluations"]
+
+
+# SWIG warns as Box2D is imported, and an error there kills the process.
+pytestmark = pytest.mark.filterwarnings("ignore:builtin type:DeprecationWarning")
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_the_first_world_computes_what_it_did(part, tmp_path):
+    gold = json.loads(GOLD.read_text())[part]
+    found = json.loads(json.dumps(PARTS[part](tmp_path)))
+    assert found.keys() == gold.keys()
+    for kind, recorded in gold.items():
+        if recorded["host"] == HOST[kind]:
+            assert found[kind] == recorded["found"], kind

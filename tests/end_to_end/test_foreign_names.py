@@ -1,6 +1,5 @@
 """Files of other people name a module in every place that holds a name: no verb imports it unless the user named it."""
 
-import io
 import json
 import os
 import shutil
@@ -20,7 +19,6 @@ from dreamfleet.common.artifacts.bundle import Bundle, write_bundle
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.artifacts.trained_agent import AgentManifest, TrainedAgent
 from dreamfleet.common.cli import command_line
-from dreamfleet.common.files.archives import ArchiveLimits, DamagedArchiveError, read_arrays
 from dreamfleet.common.runs.episode_results import EpisodeResult
 from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
 from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
@@ -223,17 +221,3 @@ def test_what_the_user_names_is_imported(folder, mark, capfd, file, task):
     assert not mark.exists()
     assert command_line.main([*words, "--trust", MARK]) == 2  # it has no such world
     assert mark.exists()
-
-
-def test_a_pickle_in_an_archive_is_never_loaded(tmp_path):
-    mark = tmp_path / "loaded"
-
-    class Evil:
-        def __reduce__(self):
-            return open, (str(mark), "w")
-
-    buffer = io.BytesIO()
-    np.savez(buffer, about=np.array([Evil()], dtype=object))
-    with pytest.raises(DamagedArchiveError):
-        read_arrays(buffer.getvalue(), ArchiveLimits(1 << 20))
-    assert not mark.exists()

@@ -1,4 +1,4 @@
-"""What unknown senders put on the wire changes nothing, and is counted."""
+"""What unknown senders put on the wire changes nothing and is counted; workers of other protocols get a remedy."""
 
 import json
 import os
@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from dreamfleet.common.client.client import Client
 from dreamfleet.common.client.status import PARTS
+from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import decode_json, encode, encode_json
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, ControlReply, HelloReply
@@ -43,13 +45,7 @@ def test_a_coordinator_drops_and_counts_what_is_malformed_or_foreign(processes, 
         assert b'"accepted": false' in replies[0].ok.payload.to_bytes()
         assert not list(session.get(keys.bundle("test", "ab" * 32), timeout=1))
     until(lambda: count_dropped(processes) >= 16)
-    counted = {
-        "not msgpack": 6,
-        "oversize": 3,
-        "foreign run": 3,
-        "schema": 3,
-        "not JSON": 1,
-    }
+    counted = {"not msgpack": 6, "oversize": 3, "foreign run": 3, "schema": 3, "not JSON": 1}
     assert processes.status()["dropped"] == counted
     processes.worker("--task", tasks.SLOW_TOY)
     assert coordinator.finish()[0] == 0
@@ -164,3 +160,22 @@ def test_a_flood_of_hellos_leaves_few_unconfirmed_workers_and_the_run_goes_on(pr
     assert 1 < status["workers"]["known"] < 400
     assert status["dropped"]["too many in a second"] > 1000
     assert resident(busy) - before < 60e6
+
+
+OTHERS = (1, 1), (3, 4), (2**60, 2**62)
+OURS = (1, 2), (2, 3), (2, 2)
+
+
+def test_a_worker_joins_if_it_speaks_this_protocol_and_else_gets_a_remedy(processes):
+    processes.coordinator("--task", tasks.TOY, "--population", 4, "--episodes", 1, "--generations", 3)
+    old = {"worker": "old/0a1b2c3d", "tasks": (tasks.TOY,), "fingerprint": fingerprint()}
+    with open_session(Network(connect=(processes.endpoint,))) as session, Client((processes.endpoint,)) as client:
+        for spoken in OTHERS:
+            reply = hello(session, **old, protocol_min=spoken[0], protocol_max=spoken[1])
+            assert not reply.accepted
+            assert all(str(each) in reply.why for each in (*spoken, keys.PROTOCOL_VERSION))
+            assert reply.remedy
+            until(lambda why=reply.why: client.status().refused == {"old": why})
+        for first, last in OURS:
+            assert hello(session, **old, protocol_min=first, protocol_max=last).accepted
+        until(lambda: not client.status().refused)

@@ -1,5 +1,6 @@
-"""Two rounds of world models and evolutions, seconds long each, left alone and killed.
-Tests dreamfleet/experiments/iteration/runner.py and dreamfleet/experiments/verbs/iterate.py."""
+"""Two rounds of world models and evolutions, seconds long each, and two kinds of MDN-RNNs, left alone and killed.
+Tests dreamfleet/experiments/iteration/runner.py, dreamfleet/experiments/verbs/iterate.py,
+dreamfleet/experiments/contrast/trials.py and dreamfleet/experiments/verbs/contrast.py."""
 
 import json
 import os
@@ -7,9 +8,9 @@ import re
 import shutil
 import signal
 import time
-from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from dreamfleet.common.artifacts.bundle import Bundle
@@ -28,7 +29,7 @@ from dreamfleet.experiments.iteration.requests import Requests
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle
-from tests.support.drives import write_drives
+from tests.support.drives import write_drives, write_encoded_drives
 from tests.support.processes import call_here, processes_in, until
 from tests.support.tables import cells
 from tests.support.variants import controller_of
@@ -72,15 +73,10 @@ def hashes(layout):
 
 def left(folder):
     """Command lines of processes that work in the folder."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            line = path.read_bytes().replace(b"\0", b" ").decode(errors="replace")
-        except OSError:  # it has just ended
-            continue
-        if str(folder) in line and int(path.parent.name) != os.getpid():
-            found.append(line)
-    return found
+    lines = (
+        " ".join(each.info["cmdline"] or ()) for each in psutil.process_iter(["cmdline"]) if each.pid != os.getpid()
+    )
+    return [line for line in lines if str(folder) in line]
 
 
 @pytest.fixture(scope="module")
@@ -388,3 +384,52 @@ def test_damage_is_said_and_made_good(undisturbed, processes):
     code, _, err = processes.call("iterate", "--data", layout.root, "--redo", "2/bundle")
     assert code == 0, err
     assert hashes(layout) == hashes(whole)
+
+
+CONTRASTED = (
+    "--mdnrnn-flags", "--updates 3 --batch 2 --set latent=4 hidden=4 validate_every=1", "--run-flags", RUN,
+    "--kind", "plain", "", "--kind", "attentive", "--set window=2 attention_units=2", "--local", 1,
+)  # fmt: skip
+
+
+@pytest.fixture
+def data(tmp_path):
+    return write_encoded_drives(tmp_path / "data")
+
+
+@pytest.mark.long
+def test_a_stopped_contrast_continues_and_compares_the_kinds(processes, data, tmp_path):
+    words = ("lab", "contrast", "--data", data, "--out", tmp_path / "out", "--seeds", 1, *CONTRASTED)
+    first = processes.start(*words)
+    first.wait_for("plain-1")
+    first.popen.send_signal(signal.SIGTERM)
+    code, _ = first.finish()
+    assert code == 130, first.lines
+
+    code, out, err = processes.call(*words, "--json")
+    assert code == 0, err
+    answer = json.loads(out)
+    assert [each["kind"] for each in answer["trials"]] == ["plain", "attentive"]
+    for each in answer["trials"]:
+        model = Bundle.open(tmp_path / "out" / f"{each['kind']}-1" / f"{each['kind']}-1.zip").manifest
+        assert model.models["mdnrnn"]["window"] == (2 if each["kind"] == "attentive" else 0)
+        assert each["quality"]["nats_per_dimension"] == model.provenance["quality"]["nats_per_dimension"]
+        with open_run(tmp_path / "out" / "runs", f"{each['kind']}-1") as run:
+            assert run.ended == "2 generations"
+            assert each["score"] == max(evaluation.mean for evaluation in run.evaluations())
+    code, _, err = processes.call(*words, "--run-flags", "--generations 9")
+    assert (code, "run_flags" in err) == (2, True), err
+
+
+def test_what_cannot_be_contrasted_is_said_at_once(tmp_path):
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    code, _, err = call_here("lab", "contrast", "--data", empty, "--out", tmp_path / "out")
+    assert (code, str(empty) in err) == (1, True), err
+    for flags, why in (
+        ("--sigma0 0.1", "--generations"),
+        ("--generations 2 --seed 4", "--seed"),
+        ("--generations 2 --population 1", "--population"),
+    ):
+        code, _, err = call_here("lab", "contrast", "--data", empty, "--out", tmp_path / "out", "--run-flags", flags)
+        assert (code, why in err) == (2, True), err

@@ -3,23 +3,20 @@ Tests common/addons/frames/live.py and worker/addons/live/verb.py."""
 
 import json
 import signal
-import subprocess
 
 import msgspec
 import pytest
 
 from dreamfleet.common.addons.frames.live import LiveView
-from dreamfleet.common.addons.frames.mjpeg import read_parts
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError, JournalError, UsageError
-from dreamfleet.common.host.processes import command
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import encode
 from dreamfleet.common.protocol.messages import ViewFrame
 from dreamfleet.common.runs.lookup import find_evaluated_mean
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
-from tests.support.processes import DEADLINE, ROOT, environment, started
+from tests.support.processes import ROOT, call_here
 from tests.support.samples import MSGPACK
 
 
@@ -92,20 +89,6 @@ def test_hostile_frames_are_dropped_and_counted(processes, run):
 
 
 @pytest.mark.slow
-def test_the_verb_streams_to_its_reader_and_ends_with_it(processes, run):
-    words = command("live", "--connect", processes.endpoint, "--out", "-")
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with started(words, env=environment(processes.cache), **pipes) as live:
-        parts = read_parts(live.stdout)
-        facts = [next(parts)[1] for _ in range(5)]
-        assert {each["run"] for each in facts} == {"test"}
-        assert facts[0]["worker"].startswith("first/")
-        live.stdout.close()
-        assert live.wait(DEADLINE) == 0
-        assert b"Traceback" not in live.stderr.read()
-
-
-@pytest.mark.slow
 def test_the_verb_writes_its_frames_when_it_is_stopped(processes, run, tmp_path):
     live = processes.start("live", "--connect", processes.endpoint, "--out", tmp_path / "stills", "--json")
     live.wait_for("test")
@@ -129,7 +112,6 @@ def test_the_verb_ends_with_the_run_and_says_how_that_ended(processes, small, tm
     assert (code, (tmp_path / "live.mp4").stat().st_size > 1000) == (0, True), out
 
 
-@pytest.mark.slow
 def test_what_cannot_be_shown_is_said_in_one_line(processes, tmp_path):
     for flags, said in (
         (("--controller", "tiny"), "--out"),
@@ -140,7 +122,7 @@ def test_what_cannot_be_shown_is_said_in_one_line(processes, tmp_path):
         (("--controller", "gone", "--generation", 3, "--out", tmp_path / "a"), "'gone'"),
         (("--connect", "tcp/127.0.0.1:9", "--out", tmp_path / "a"), "tcp/127.0.0.1:9"),
     ):
-        code, _, err = processes.call("live", "--runs-dir", processes.runs, *flags)
+        code, _, err = call_here("live", "--runs-dir", processes.runs, *flags)
         assert (code != 0, said in err.splitlines()[-1], "Traceback" in err) == (True, True, False), err
 
 

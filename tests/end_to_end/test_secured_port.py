@@ -1,4 +1,8 @@
-"""Who does what at a secured port, with a join file or without one: it is refused or bounded, and costs no bit."""
+"""Who does what at a secured port, with a join file or without one, or at an open port: it costs no bit.
+
+At an open port the attacker has a session of Zenoh and nothing else: it overhears names, lives, nonces, batches and
+fingerprints. What rules cannot hold off is not here: docs/explanation/threats.md names it.
+"""
 
 import resource
 import socket
@@ -8,8 +12,10 @@ from pathlib import Path
 import pytest
 
 from dreamfleet.common.client.client import Client
+from dreamfleet.common.transport.session import Network
+from tests.support import tasks
 from tests.support.access import begin, work
-from tests.support.attacks import CLAIMED, RUN, SECURED, SETTINGS, attacking, outcome, steers_by_name
+from tests.support.attacks import CLAIMED, OPEN, RUN, SECURED, SETTINGS, attacking, outcome, steers_by_name
 from tests.support.processes import until
 
 # What arrives of each, and is counted: nothing of who only looks or steers; of a worker what it says in its own name.
@@ -114,3 +120,40 @@ def test_strangers_take_no_descriptor_for_good(processes, access, endpoint, rand
     until(lambda: open_files(coordinator) <= before, "descriptors do not come back")
     work(processes, access, endpoint, "first").wait_for_event("joined")
     assert coordinator.finish()[0] == 0
+
+
+def connects_without_end(evil, number):
+    if number < 5:
+        host, port = evil.endpoint.partition("/")[2].split(":")
+        for _ in range(200):
+            socket.create_connection((host, int(port))).close()
+
+
+ACTIONS = [*OPEN, connects_without_end]
+
+
+def harmed(processes, random_bundle, *actions):
+    coordinator = processes.coordinator("--bundle", random_bundle.path, *SETTINGS)
+    with attacking(Network(connect=(processes.endpoint,)), *actions) as evil:
+        processes.worker("--task", tasks.SLOW_TOY, "--name", "own")
+        assert coordinator.finish()[0] == 0
+    assert not evil.steered
+    return evil, coordinator
+
+
+@pytest.mark.slow
+def test_at_an_open_port_all_at_once_change_no_bit(processes, random_bundle, unharmed):
+    evil, coordinator = harmed(processes, random_bundle, *ACTIONS)
+    assert outcome(processes) == unharmed, "\n".join(coordinator.lines)
+    assert evil.dropped.keys() >= {
+        "result of an unknown worker", "result of a job that was not given",
+        "result of another fingerprint than its worker's", "lease with more steps than a job has",
+    }  # fmt: skip
+    assert not coordinator.events("paused")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("action", ACTIONS, ids=lambda action: action.__name__)
+def test_each_alone_changes_no_bit(processes, random_bundle, unharmed, action):
+    harmed(processes, random_bundle, action)
+    assert outcome(processes) == unharmed

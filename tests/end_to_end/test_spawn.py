@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -14,8 +15,8 @@ from dreamfleet.common.addons.access.authority import Authority
 from dreamfleet.coordinator.addons.spawn.agent import process_start
 from tests.support import tasks
 from tests.support.disks import small_disk
-from tests.support.processes import until
-from tests.support.spawned import rows_of, words
+from tests.support.processes import DEADLINE, until
+from tests.support.programs import find_program
 from tests.support.sshd import closed_port, new_key
 
 TOY = ("--task", tasks.TOY, "--population", 4, "--episodes", 1, "--evaluate-every", 0)
@@ -29,6 +30,17 @@ def write_file(processes, hosts, *names, more=""):
         f'worker_flags = "--task {tasks.TOY}"\n{more}\n{rows}'
     )
     return path
+
+
+def words(hosts, *more):
+    return ("--ssh", hosts.ssh, "--remote-python", sys.executable, *more)
+
+
+def rows_of(processes, *arguments, code=0, patience=DEADLINE):
+    """The rows that a verb prints, by host."""
+    done, out, err = processes.call(*arguments, "--json", timeout=patience)
+    assert done == code, err
+    return {row["host"]: row for row in json.loads(out.splitlines()[-1])["hosts"]}
 
 
 def pid_on(host):
@@ -217,3 +229,33 @@ def test_a_join_file_is_handed_over_by_no_command_line_for_its_reader_alone(proc
     assert "PRIVATE" not in (tmp_path / "words").read_text()
     rows_of(processes, "down", "a", *words(hosts))
     assert list(a.home.iterdir()) == []
+
+
+BASH = 'BASH_ENV=$HOME/.bashrc exec bash -c "$SSH_ORIGINAL_COMMAND"'  # as bash reads it under sshd
+FISH, TCSH = (f'exec {shell} -c "$SSH_ORIGINAL_COMMAND"' for shell in ("fish", "tcsh"))  # as sshd calls a login shell
+SHELLS = {
+    "fish": (FISH, ".config/fish/config.fish", "echo 'dreamfleet-host, but not ours: welcome to $fish'"),
+    "tcsh": (TCSH, ".cshrc", "echo 'Welcome!'"),
+    "banner": (BASH, ".bashrc", "echo Welcome; echo 'Do not disturb' >&2; printf 'no line end'"),
+    "hanging": (BASH, ".bashrc", "sleep 1000"),
+    "endless": (BASH, ".bashrc", "while :; do echo Welcome; done"),
+    "waiting": (BASH, ".bashrc", "read -r answer; exit 0"),
+}
+
+
+@pytest.mark.long
+@pytest.mark.needs_programs("sshd", "ssh", "fish", "tcsh")
+def test_any_login_shell_serves_and_a_broken_one_is_one_row(processes, hosts):
+    for name, (command, file, text) in SHELLS.items():
+        programs = f"{Path(find_program('fish')).parent}:/usr/bin:/bin"
+        path = hosts.add(name, ForceCommand=command, path=programs).home / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"{text}\n")
+    spawn = ("spawn", *SHELLS, "--connect", processes.endpoint, "--no-tunnel", "--slots", 1, *words(hosts))
+    rows = rows_of(processes, *spawn, code=1, patience=3 * DEADLINE)
+    assert [rows[name]["state"] for name in ("fish", "tcsh", "banner")] == ["started"] * 3
+    assert " 60 " in rows["hanging"]["what"]
+    assert " 1 " in rows["endless"]["what"]
+    assert rows["waiting"]["state"] == "failed"
+    down = rows_of(processes, "down", "fish", "tcsh", "banner", "--now", "--ssh", hosts.ssh)
+    assert {row["state"] for row in down.values()} == {"left"}

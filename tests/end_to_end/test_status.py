@@ -3,18 +3,28 @@ Tests common/client/client.py, coordinator/addons/status/verb.py and coordinator
 
 import json
 import os
+import shlex
 import signal
+import subprocess
 import sys
+import time
+import urllib.error
+import urllib.request
+import uuid
 
 import pytest
+from prometheus_client.parser import text_string_to_metric_families
 
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError, ControllerError
+from dreamfleet.common.host.processes import command
+from dreamfleet.common.host.reports import ADDRESS
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.coordinator.addons.status import verb as status
 from tests.support import tasks
-from tests.support.processes import call_here
+from tests.support.processes import DEADLINE, call_here, environment, free_port
+from tests.support.served import serving, snapshot
 
 
 @pytest.mark.slow
@@ -104,3 +114,94 @@ def test_a_terminal_that_cannot_draw_over_a_line_has_lines_as_a_pipe_has(monkeyp
     with open(controller, "rb"), open(device, "w") as stdout:  # noqa: PTH123 - descriptors
         monkeypatch.setattr(sys, "stdout", stdout)
         assert status._can_redraw() == redraws
+
+
+NAMES = [f"a-host-of-thirty-letters-x{number:04d}" for number in range(2)]
+
+
+class Terminal:
+    """A tmux server of its own with one window."""
+
+    def __init__(self, words, env):
+        self._socket = f"dreamfleet-{uuid.uuid4().hex}"
+        named = [f"{name}={value}" for name, value in env.items() if name not in ("COLUMNS", "TERM", "TMUX")]
+        line = shlex.join(["env", "-u", "COLUMNS", *named, *words])
+        self._call("new-session", "-d", "-x", "80", "-y", "24", f"{line}; printf over; cat")
+
+    def wait_for(self, *texts):
+        """The lines of the screen, once it has these texts."""
+        deadline = time.monotonic() + DEADLINE
+        while not all(text in (seen := self._call("capture-pane", "-p")) for text in texts):
+            assert time.monotonic() < deadline, seen
+        return seen.splitlines()
+
+    def end(self):
+        subprocess.run(["tmux", "-L", self._socket, "kill-server"], check=False, capture_output=True)
+
+    def _call(self, *words):
+        done = subprocess.run(["tmux", "-L", self._socket, *words], check=True, capture_output=True, text=True)
+        return done.stdout
+
+
+@pytest.fixture
+def terminal(processes):
+    words = command("status", "--connect", processes.endpoint, "--watch")
+    made = Terminal(words, environment(processes.cache))
+    yield made
+    made.end()
+
+
+@pytest.mark.slow
+@pytest.mark.needs_programs("tmux")
+def test_a_watcher_sees_the_whole_run_in_24_lines_and_at_last_its_end(processes, terminal, small):
+    coordinator = processes.coordinator(*small, "--episodes", 2, "--generations", 4)
+    terminal.wait_for("waiting for workers")
+    for name in NAMES:
+        processes.worker("--task", tasks.SLOW_TOY, "--name", name)
+    seen = terminal.wait_for(*NAMES)
+    assert max(map(len, seen)) <= 80
+    assert not any("…" in line for line in seen)
+    assert coordinator.finish()[0] == 0
+    last = terminal.wait_for("over")
+    assert last[0].startswith("╭─ test · ")
+    assert "4 generations" in last[1]
+
+
+TOKEN = "correct horse battery"
+
+
+def read(port, path="/metrics"):
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=DEADLINE) as answer:
+        text = answer.read().decode()
+    return {sample.name: sample for family in text_string_to_metric_families(text) for sample in family.samples}
+
+
+@pytest.mark.slow
+def test_a_coordinator_answers_prometheus(processes, small):
+    port = free_port()
+    coordinator = processes.coordinator(*small, "--task", tasks.TOY, "--metrics-port", port)
+    assert read(port)["dreamfleet_generation"].value == 0
+    processes.worker("--task", tasks.TOY, "--name", "host-a")
+    coordinator.wait_for_event("generation", number=1)
+    while (found := read(port))["dreamfleet_generations_closed_total"].value < 1:
+        pass  # a snapshot is a fifth of a second old
+    assert found["dreamfleet_worker_slots"].labels["worker"].startswith("host-a/")
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        read(port, "/")
+    for wrong in ("none", "0", "host:", "70000"):
+        code, _, err = call_here("coordinator", "--run", "x", "--runs-dir", processes.runs, "--metrics-port", wrong)
+        assert (code, "--metrics-port" in err) == (2, True), err
+
+
+def test_the_dashboard_answers_for_every_live_run_to_holders_of_the_token(processes):
+    with serving(processes.endpoint, snapshot(workers=80), snapshot(name="lucid")):
+        page = processes.start("dashboard", "--connect", processes.endpoint, "--port", 0, "--token", TOKEN)
+        address = page.wait_for_report(ADDRESS)
+        with pytest.raises(urllib.error.HTTPError, match="401"):
+            urllib.request.urlopen(f"{address}metrics", timeout=DEADLINE)
+        asked = urllib.request.Request(f"{address}metrics", headers={"Authorization": f"Bearer {TOKEN}"})
+        with urllib.request.urlopen(asked, timeout=DEADLINE) as answer:
+            text = answer.read().decode()
+    found = {each.name: each.samples for each in text_string_to_metric_families(text)}
+    assert [each.labels["run"] for each in found["dreamfleet_generation"]] == ["lucid", "night"]
+    assert sum(each.labels["run"] == "night" for each in found["dreamfleet_worker_slots"]) == 80, "not the head alone"

@@ -1,10 +1,13 @@
 """Runs whose controllers drive otherwise: each option is replayed to the bit, and every verb knows of it."""
 
+import json
+
 import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.runs.run_folder import open_run
+from tests.support import checkpoint_files
 from tests.support.processes import call_here
 from tests.support.same_bits import evolve
 
@@ -13,12 +16,9 @@ RUNS = {
     "pedals": (("--variant", "pedals=one", "pedal_shift=0.25"), (288, 2)),
     "halves": (("--preset", "article"), (288, 3)),
     "discrete": (("--variant", "actions=discrete"), (288, 5)),
-    "held": (("--variant", "decide_every=4"), (288, 3)),
-    "feedback": (("--variant", "feedback=last"), (294, 3)),
     "time": (("--variant", "time_cost=0.5"), (288, 3)),
     "dreamt": (("--task", "dream", "--variant", "pedals=one", "decide_every=3", "feedback=last"), (292, 2)),
 }
-OFTEN = ("pedals", "feedback", "dreamt")
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def driven(small):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "kind", [*OFTEN, *(pytest.param(each, marks=pytest.mark.long) for each in RUNS if each not in OFTEN)]
+    "kind", [pytest.param(each, marks=() if each == "dreamt" else pytest.mark.long) for each in RUNS]
 )
 def test_a_run_evolves_and_is_replayed_to_the_same_bits(processes, driven, kind):
     flags, shape = RUNS[kind]
@@ -47,6 +47,8 @@ def test_every_verb_drives_as_the_run_does(processes, driven):
     variant = ("--variant", "pedals=one", "decide_every=3", "feedback=last")
     evolve(processes, "one", 1, *driven, *variant, "--collect-every", 1, "--collect-episodes", 1)
     runs = ("--runs-dir", processes.runs)
+    code, out, err = call_here("verify", "candidate", "one", *runs, "--candidate", "1/2")
+    assert (code, out.count("same bits")) == (0, 1), err
     code, out, err = call_here("runs", "show", "one", *runs)
     assert '"decide_every": 3' in out, err
     code, out, err = call_here("evaluate", "--controller", "one", *runs, "--episodes", 2, "--jobs", 2)
@@ -64,3 +66,25 @@ def test_every_verb_drives_as_the_run_does(processes, driven):
             steps = drive["action"][: HORIZON // 3 * 3].reshape(-1, 3, 3)
             assert (steps == steps[:, :1]).all()
             assert not (drive["action"][:, 1] * drive["action"][:, 2]).any(), "nobody brakes on the gas"
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_from_a_controller_of_ctallec(processes, tmp_path):
+    imported = tmp_path / "exp_dir"
+    checkpoint_files.write_checkpoints(imported, checkpoint_files.random_weights())
+    world, controller = tmp_path / "world.zip", tmp_path / "controller.npz"
+    for command in ((imported, "--out", world), (imported / "ctrl", "--bundle", world, "--out", controller)):
+        found = processes.call("import", *command)
+        assert found[0] == 0, found
+    few = ("--population", 4, "--episodes", 1, "--horizon", 5, "--evaluate-every", 0, "--generations", 1)
+    coordinator = processes.coordinator("--bundle", world, "--init", controller, *few)
+    processes.worker("--exit-when-done")
+    assert coordinator.finish()[0] == 0
+    with open_run(processes.runs, "test") as run:
+        evolved = Controller.load(run.controller_path)
+    assert evolved.variant.actions == "linear"
+    replayed = processes.call("verify", "candidate", "test", "--candidate", "0/1", "--runs-dir", processes.runs)
+    assert replayed[0] == 0, replayed
+    judged = processes.call("evaluate", "--controller", controller, "--bundle", world, "--episodes", 1, "--json")
+    assert judged[0] == 0, judged
+    assert isinstance(json.loads(judged[1])["mean"], float), judged

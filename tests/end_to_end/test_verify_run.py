@@ -30,9 +30,10 @@ sigma0 = 0.3
 """
 
 
-@pytest.fixture
-def first(processes, small, random_bundle, tmp_path):
-    """The controller of a run of two stages that began from another controller; its journal is gone."""
+@pytest.mark.slow
+def test_a_run_of_two_stages_from_a_controller_is_repeated_through_a_kill_and_a_script_says_if_it_is_not_the_same(
+    processes, small, random_bundle, tmp_path
+):
     (tmp_path / "stages.toml").write_text(STAGES)
     shape = random_bundle.controller_shape
     start = np.linspace(-1, 1, shape.size, dtype=np.float32)
@@ -44,15 +45,10 @@ def first(processes, small, random_bundle, tmp_path):
     )  # fmt: skip
     processes.worker("--task", tasks.TOY, "--run", "first", "--exit-when-done")
     assert coordinator.finish()[0] == 0
-    kept = tmp_path / "kept.npz"
-    (processes.runs / "first" / CONTROLLER).rename(kept)
+    first = tmp_path / "kept.npz"
+    (processes.runs / "first" / CONTROLLER).rename(first)
     (tmp_path / "start.npz").unlink()
     assert processes.call("runs", "delete", "first", "--yes", "--runs-dir", processes.runs)[0] == 0
-    return kept
-
-
-@pytest.mark.slow
-def test_a_run_is_repeated_to_the_bit_through_a_stop_that_says_how_to_go_on(processes, first, random_bundle):
     words = ("verify", "run", first, "--bundle", random_bundle.path, "--runs-dir", processes.runs, "--listen",
              processes.endpoint, "--beat", 0.2, "--json")  # fmt: skip
     again = processes.start(*words)
@@ -73,14 +69,9 @@ def test_a_run_is_repeated_to_the_bit_through_a_stop_that_says_how_to_go_on(proc
     with open_run(processes.runs, "kept-again") as run:
         assert len(run.history()) == read_run_provenance(before).generations
         assert len(run.settings.stages) == 2
-
-
-@pytest.mark.slow
-def test_a_script_runs_both_sides_and_its_exit_code_says_whether_it_is_the_same(processes, first):
-    receipt = Controller.load(first)
-    changed = {**receipt.provenance, "settings": {**receipt.provenance["settings"], "seed": 2}}
-    moved = processes.folder / "moved.npz"
-    Controller(receipt.shape, receipt.parameters, receipt.task, receipt.bundle, changed).save(moved)
+    changed = {**before.provenance, "settings": {**before.provenance["settings"], "seed": 2}}
+    moved = tmp_path / "moved.npz"
+    Controller(shape, before.parameters, tasks.TOY, random_bundle.sha256, changed).save(moved)
     done = subprocess.run(
         [sys.executable, ROOT / "deploy" / "reproduce_evolution.py", moved, "--workers", "1", "--port",
          str(processes.port), "--runs-dir", processes.runs, "--task", tasks.TOY],

@@ -117,7 +117,6 @@ class Attacker:
         self.dropped = json.loads(sample.payload.to_bytes())["dropped"]
 
     def hello(self, worker):
-        """Send hello as this worker."""
         request = replace(JSON["hello-request"], worker=worker, fingerprint=self.fingerprint or FORGED[0], slots=1,
                           tasks=(tasks.SLOW_TOY,), protocol_min=2, protocol_max=2)  # fmt: skip
         where = keys.hello(RUN) if self.seat is None else keys.secured_hello(RUN, worker)
@@ -171,13 +170,9 @@ def fail(digest):
     return Result(digest, None, 0, 0.1, failure("forged"), None)
 
 
-def reports_results_of_all_jobs(evil, _round):
+def reports_all_jobs(evil, _round):
     for worker in ("stranger/00000001", "another/00000002"):
         evil.report(worker, *map(lie, list(evil.jobs)[-32:]))
-
-
-def reports_failures_of_all_jobs(evil, _round):
-    for worker in ("stranger/00000001", "another/00000002"):
         evil.report(worker, *map(fail, list(evil.jobs)[-32:]))
 
 
@@ -258,8 +253,7 @@ def steers_by_name(evil, _round):
 
 
 OPEN = [
-    reports_results_of_all_jobs, reports_failures_of_all_jobs,
-    reports_a_foreign_fingerprint_as_a_worker, joins_and_reports_others_jobs,
+    reports_all_jobs, reports_a_foreign_fingerprint_as_a_worker, joins_and_reports_others_jobs,
     joins_and_holds_its_jobs_by_growing_steps, greets_as_the_working_worker, steers_by_wildcards,
     sends_a_worker_batches_that_nobody_counted, fills_a_workers_memory,
 ]  # fmt: skip

@@ -20,7 +20,6 @@ class SmallDisk:
         return self._ballast.exists()
 
     def fill(self):
-        """Use every byte."""
         with self._ballast.open("wb") as file:
             for step in (1 << 24, 1 << 16, 1 << 12):
                 try:
@@ -30,7 +29,6 @@ class SmallDisk:
                     continue
 
     def free(self):
-        """Free the bytes that `fill` used."""
         self._ballast.unlink(missing_ok=True)
 
     def remove(self):

@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from dreamfleet.worker.worlds.takecover.game import TakeCover
@@ -39,15 +40,13 @@ def search_path():
     return os.pathsep.join([str(FAKE), str(ROOT)] if str(FAKE) in sys.path else [str(ROOT)])
 
 
-def games(parent=None, environment=b""):
-    """Ids of the running processes of games, or of those with this parent, or with this text in their environment."""
+def games(parent):
+    """Ids of the running processes of games with this parent."""
     found = set()
-    for process in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):  # it has ended
-            state, its_parent, *_ = (process / "stat").read_text().rpartition(") ")[2].split()
-            is_game = GAME_NAME_FLAG.encode() in (process / "cmdline").read_bytes().split(b"\0") and state not in "ZX"
-            if is_game and parent in (None, int(its_parent)) and environment in (process / "environ").read_bytes():
-                found.add(int(process.name))
+    for each in psutil.Process(parent).children():
+        with suppress(psutil.NoSuchProcess, psutil.ZombieProcess):  # it has ended
+            if GAME_NAME_FLAG in each.cmdline():
+                found.add(each.pid)
     return found
 
 

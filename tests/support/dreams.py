@@ -41,7 +41,6 @@ ACTIONS = {
 
 
 def write_bundle_of(world, path, recorded=None, **options):
-    """A random bundle of one of the worlds."""
     if WORLDS[world] is None:
         return write_random_bundle(path, vae=VAE, rnn=MODELS[world], recorded=recorded)
     return write_world_bundle(path, WORLDS[world], vae=VAE, rnn=MODELS[world], recorded=recorded, **options)

@@ -1,4 +1,4 @@
-"""What CarRacing, the first world, computes: its drives, world models, trainings, dreams and settings.
+"""What CarRacing, the first world, computes: its drives, world models, trainings and dreams.
 
 `python -m tests.support.first_world [PART ...]` writes these parts, or all, into `tests/fixtures/world_model.json`.
 Do that only for a change that means to move them, and say in its message why they move.
@@ -26,11 +26,6 @@ from dreamfleet.common.artifacts.bundle import MANIFEST, write_bundle
 from dreamfleet.common.artifacts.car_racing_variants import CAR_RACING, Variant
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES, fingerprint
 from dreamfleet.common.protocol.messages import TaskSpec
-from dreamfleet.common.runs.lookup import find_subspace
-from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.coordinator.settings.config import RunConfig
-from dreamfleet.coordinator.settings.freezing import freeze
-from dreamfleet.coordinator.settings.presets import find_preset
 from dreamfleet.worker.dream.batch import DreamBatch
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, write_episode
 from dreamfleet.worker.scoring.scorer import Scorer
@@ -52,7 +47,6 @@ from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import random_rnn_weights, random_vae_weights
 from tests.support.drives import write_drives
-from tests.support.processes import processes_in
 from tests.support.variants import VARIANTS, vectors
 
 GOLD = Path(__file__).parents[1] / "fixtures" / "world_model.json"
@@ -67,7 +61,6 @@ DRIVES = {
     "impatient": (replace(STEPS, anywhere=0.0, patience=5), 4),
 }
 FIRST_VARIANTS = {name: variant for name, variant in VARIANTS.items() if variant.actions != "linear"}  # a later one
-FIRST_RUN_PRESETS = ("article", "dream", "frugal", "mixed", "notebook", "paper", "real")
 SMALL_VAE = VAEConfig(latent=4, channels=(2, 2, 2, 2))
 SMALL = MDNRNNConfig(latent=4, hidden=8, mixtures=2)
 LAYERS = {
@@ -241,28 +234,12 @@ def episodes(_folder):
     return {"simulator": found}
 
 
-def settings(folder):
-    """The settings that a run's journal holds, by flags and by presets, and the digest of a job."""
-    with processes_in(folder) as processes:
-        processes.coordinator("--bundle", "tiny").end()
-        with open_run(processes.runs, "test") as run:
-            journalled = run.fact("settings")
-    found = {}
-    for name in FIRST_RUN_PRESETS:
-        config = RunConfig(**find_preset(name))
-        if config.subspace is not None:
-            config = replace(config, loaded_subspace=find_subspace(config.subspace))
-        settings = freeze(config, find_bundle("tiny"))
-        found[name] = [settings.to_json(), settings.task.digest("score", bytes(32), (SEED,)).hex()]
-    return {"everywhere": {"journalled": journalled, "presets": found}}
-
-
 def ignore(*_):
     pass
 
 
 PARTS: dict[str, Callable[[Path], dict[str, dict]]] = {
-    each.__name__: each for each in (drives, bundles, trainings, dreams, episodes, settings)
+    each.__name__: each for each in (drives, bundles, trainings, dreams, episodes)
 }
 
 

@@ -105,7 +105,6 @@ class Hand:
         return self.next(Heartbeat, accept)
 
     def ready(self):
-        """Wait until the worker can score."""
         self.hello()
         return self.beat(lambda beat: beat.capacity > 0)
 

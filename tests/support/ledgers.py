@@ -1,9 +1,14 @@
-"""Ledgers of iterations."""
+"""Ledgers of iterations, and what their phases ask for."""
+
+from pathlib import Path
 
 from dreamfleet.experiments.iteration.config import IterateConfig
+from dreamfleet.experiments.iteration.layout import IterationFolder
 from dreamfleet.experiments.iteration.ledger import FinishedPhase, IterationLedger
+from dreamfleet.experiments.iteration.requests import Requests
 
 RUN = {"task": "dream", "population": 64, "collect_every": 0, "stages": ()}
+LAYOUT = IterationFolder(Path("data"))
 
 
 def entry(number, phase, made=(), **figures):
@@ -17,3 +22,7 @@ def ledger(*entries):
     for each in entries:
         found = found.add(each)
     return found
+
+
+def requests(*entries, **changes):
+    return Requests(IterateConfig(**changes), LAYOUT, ledger(*entries))

@@ -13,21 +13,9 @@ from dreamfleet.common.protocol.codec import encode
 from tests.support.samples import MSGPACK
 
 WHOLE = [encode(message) for message in MSGPACK.values()]
-
-
 NUMBERS = [
-    b"-1",
-    b"0",
-    b"99999999999999999999",
-    b"1e999",
-    b"NaN",
-    b"null",
-    b"[]",
-    b"{}",
-    b'"x"',
-    b"1" * 5000,
-    b"[" * 3000,
-]
+    b"-1", b"0", b"99999999999999999999", b"1e999", b"NaN", b"null", b"[]", b"{}", b'"x"', b"1" * 5000, b"[" * 3000,
+]  # fmt: skip
 MOST_SECONDS, MOST_KILOBYTES = 10, 300_000
 
 
@@ -87,15 +75,10 @@ def archives(whole, count, seed):
         if kind == 0:
             yield mutate(source, whole, [whole])
         elif kind == 1:
-            yield mutate_tail(source, whole)
+            cut = max(0, len(whole) - 2000)  # where the archive's directory is
+            yield whole[:cut] + mutate(source, whole[cut:], [whole])
         else:
             yield packed(_within(source, members, kind == 3), source.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)))
-
-
-def mutate_tail(source, whole):
-    """Damage to the archive's directory."""
-    cut = max(0, len(whole) - 2000)
-    return whole[:cut] + mutate(source, whole[cut:], [whole])
 
 
 def _within(source, members, words):
@@ -113,7 +96,6 @@ def _within(source, members, words):
 
 
 def packed(members, kind=zipfile.ZIP_STORED):
-    """Pack members as an archive."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", kind) as archive:
         for name, data in members.items():
@@ -142,7 +124,6 @@ class Watched:
             self._slowest = max(self._slowest, process_time() - began)
 
     def check(self):
-        """Check the cost of all reads."""
         assert not [text for text in self._said if not text or "\n" in text]
         assert self._slowest < MOST_SECONDS
         assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - self._before < MOST_KILOBYTES

@@ -38,8 +38,6 @@ class InDict(Observing):
 
 
 class InTwo(InDict):
-    """Observes a Dict of two pictures."""
-
     observation_space = spaces.Dict({"screen": Dodge.observation_space, "map": Dodge.observation_space})
 
     def observe(self, picture):
@@ -142,7 +140,38 @@ class Unseen(Observing):
     observation_space = spaces.Box(-1, 1, (2,), np.float32)
 
     def observe(self, picture):
-        return np.zeros(2, np.float32)
+        return np.float32([self._player / WIDTH, self._row / HEIGHT])
+
+
+class Single(Unseen):
+    """Refuses a second instance while one is open, as many simulators do."""
+
+    is_open = False
+
+    def __init__(self, render_mode=None):
+        super().__init__(render_mode)
+        if Single.is_open:
+            raise RuntimeError("another one is open")
+        Single.is_open = True
+
+    def close(self):
+        Single.is_open = False
+
+
+class Shared(Unseen):
+    """Its `close` shuts what all instances share."""
+
+    def __init__(self, render_mode=None):
+        super().__init__(render_mode)
+        Shared.is_on = True
+
+    def step(self, action):
+        if not Shared.is_on:
+            raise RuntimeError("the simulator is off")
+        return super().step(action)
+
+    def close(self):
+        Shared.is_on = False
 
 
 class Board(Unseen):
@@ -203,8 +232,6 @@ class Mute(Gauges):
 
 
 class Blind(Gauges):
-    """Observes nothing."""
-
     observation_space = spaces.Box(-1, 1, (0,), np.float32)
 
 
@@ -271,7 +298,7 @@ class Rude(Dodge):
 
 KINDS = (
     Faulty, Rude, InDict, InTwo, Grey, ChannelsFirst, Stacked, Floats, Buttons, Switches, BothEnds, Unseen, Board,
-    Gauges, Telling, Mute, Blind,
+    Gauges, Telling, Mute, Blind, Single, Shared,
 )  # fmt: skip
 for each in KINDS:
     gymnasium.register(f"{each.__name__}-v0", each, max_episode_steps=200)

@@ -68,7 +68,6 @@ def environment(cache, root=ROOT):
 
 
 def until(found, what="what is waited for"):
-    """Block until it is found."""
     deadline = time.monotonic() + DEADLINE
     while not found():
         assert time.monotonic() < deadline, f"{what} did not come"
@@ -216,13 +215,9 @@ class Processes:
     def call(self, *arguments, timeout=DEADLINE):
         """Run a verb to its end: exit code, stdout, stderr."""
         done = subprocess.run(
-            command(*arguments),
-            env=environment(self.cache),
-            capture_output=True,
-            check=False,
-            text=True,
+            command(*arguments), env=environment(self.cache), capture_output=True, check=False, text=True,
             timeout=timeout,
-        )
+        )  # fmt: skip
         return done.returncode, done.stdout, done.stderr
 
     def status(self):

@@ -1,4 +1,4 @@
-"""Tasks whose environments leave processes behind, end their process, or raise what nobody expects."""
+"""Tasks whose episodes leave processes behind, end their process, or raise what nobody expects."""
 
 import ctypes
 import errno
@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from dreamfleet.worker.tasks.api import Score
-from tests.support.tasks import SideBySide, Toy, ToyEnvironment
+from tests.support.tasks import Misbehaving, SideBySide, Toy, ToyEnvironment
 
 MODULE = "tests.support.rough_tasks"
 FOLDER = "DREAMFLEET_TEST_LEFT"  # where processes that are left behind write their ids
@@ -28,22 +28,8 @@ def name_of(task):
     return f"{MODULE}:{task.__name__}"
 
 
-class Rough(Toy):
-    """An episode's first step calls `misbehave`."""
-
+class Rough(Misbehaving):
     probe_steps = 0
-
-    def make_environment(self, assignment):
-        return RoughEnvironment(self.misbehave)
-
-
-class Halting(Toy):
-    """The second step of the seeds in `$DREAMFLEET_TEST_HALT` never ends; those in `..._EXIT` end their process."""
-
-    probe_steps = 0
-
-    def make_environment(self, assignment):
-        return HaltingEnvironment()
 
 
 class HaltingEnvironment(ToyEnvironment):
@@ -59,14 +45,10 @@ class HaltingEnvironment(ToyEnvironment):
         return super().step(action)
 
 
-class RoughEnvironment(ToyEnvironment):
-    def __init__(self, misbehave):
-        super().__init__()
-        self._misbehave = misbehave
+class Halting(Toy):
+    """The second step of the seeds in `$DREAMFLEET_TEST_HALT` never ends; those in `..._EXIT` end their process."""
 
-    def step(self, action):
-        self._misbehave()
-        return super().step(action)
+    probe_steps, environment = 0, HaltingEnvironment
 
 
 def segfault():
@@ -131,10 +113,7 @@ class Executing(Rough):
 
     def misbehave(self):
         subprocess.Popen(
-            [sys.executable, "-S", "-c", SLEEP],
-            env={FOLDER: os.environ[FOLDER]},
-            process_group=0,
-            close_fds=False,
+            [sys.executable, "-S", "-c", SLEEP], env={FOLDER: os.environ[FOLDER]}, process_group=0, close_fds=False
         )
         wait_for_one_left()
         segfault()
@@ -233,13 +212,6 @@ class Poisoned(Rough):
             POISONS[os.environ[POISON]]()
 
 
-class Wearing(Toy):
-    """Only the first episode of an environment ends well."""
-
-    def make_environment(self, assignment):
-        return WearingEnvironment()
-
-
 class WearingEnvironment(ToyEnvironment):
     steps = 0
 
@@ -250,19 +222,22 @@ class WearingEnvironment(ToyEnvironment):
         return super().step(action)
 
 
-class SlowToBegin(SideBySide):
-    """A reset takes a second."""
+class Wearing(Toy):
+    """Only the first episode of an environment ends well."""
 
-    probe_steps = 0
-
-    def make_environment(self, assignment):
-        return SlowToBeginEnvironment()
+    environment = WearingEnvironment
 
 
 class SlowToBeginEnvironment(ToyEnvironment):
     def reset(self, *, seed=None, options=None):
         time.sleep(1.0)
         return super().reset(seed=seed, options=options)
+
+
+class SlowToBegin(SideBySide):
+    """A reset takes a second."""
+
+    probe_steps, environment = 0, SlowToBeginEnvironment
 
 
 class OnlyOne(SideBySide):
@@ -278,21 +253,20 @@ class OnlyOne(SideBySide):
         return ToyEnvironment()
 
 
-class OneCrashes(Toy):
-    """The episode with the seed `DEADLY` kills its process."""
-
-    def make_environment(self, assignment):
-        return DeadlyEnvironment()
-
-
-DEADLY = 1048576 + 2
-
-
 class DeadlyEnvironment(ToyEnvironment):
     def reset(self, *, seed=None, options=None):
         if seed == DEADLY:
             os.kill(os.getpid(), signal.SIGSEGV)
         return super().reset(seed=seed, options=options)
+
+
+class OneCrashes(Toy):
+    """The episode with the seed `DEADLY` kills its process."""
+
+    environment = DeadlyEnvironment
+
+
+DEADLY = 1048576 + 2
 
 
 class PoisonedBatch(Toy):

@@ -82,7 +82,6 @@ class Bench:
         self.begin()
 
     def wait(self, seconds=1.0):
-        """Let time pass."""
         self.now += seconds
         self.run.tick(self.now)
 

@@ -46,18 +46,11 @@ HEAD = {"run_uid": UID, "incarnation": 3}
 
 
 def job(episode=0, kind="score", candidate=2, spec=SPEC, seed=1048576, **named):
+    digest = spec.with_overrides(**named).digest(kind, VECTOR_ID, (seed + episode,))
     return Job(
-        kind=kind,
-        task=spec.task,
-        generation=7,
-        candidate=candidate,
-        episode=episode,
-        seeds=(seed + episode,),
-        vector=VECTOR_ID,
-        digest=spec.with_overrides(**named).digest(kind, VECTOR_ID, (seed + episode,)),
-        stall=30.0,
-        **named,
-    )
+        kind=kind, task=spec.task, generation=7, candidate=candidate, episode=episode, seeds=(seed + episode,),
+        vector=VECTOR_ID, digest=digest, stall=30.0, **named,
+    )  # fmt: skip
 
 
 WHOLE = VectorPart(id=VECTOR_ID, dtype="<f4", shape=(16,), offset=0, data=VECTOR)

@@ -87,5 +87,4 @@ def wait_for(lines, text):
 
 
 def drained(lines):
-    """Take all queued lines."""
     return [lines.get_nowait() for _ in range(lines.qsize())]

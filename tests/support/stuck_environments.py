@@ -37,8 +37,6 @@ class Mistaken(CartPoleEnv):
 
 
 class HandsOn(Mistaken):
-    """Hands its arguments on."""
-
     def __init__(self, **arguments):
         super().__init__(**arguments)
 

@@ -35,22 +35,26 @@ class ToyEnvironment(gymnasium.Env):
 
     observation_space = spaces.Box(-1, 1, (1,))
     action_space = spaces.Box(-1, 1, (8,))
+    length = 10
 
     def __init__(self, seconds=0.0):
         self._seconds = seconds
 
+    def look(self):
+        return np.zeros(1, np.float32)
+
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self._target = self.np_random.normal(0.5, 0.1, 8)
-        self._left = 10
-        return np.zeros(1, np.float32), {}
+        self._left = self.length
+        return self.look(), {}
 
     def step(self, action):
         if self._seconds:
             time.sleep(self._seconds)
         self._left -= 1
         reward = -float(((action - self._target) ** 2).sum())
-        return np.zeros(1, np.float32), reward, self._left == 0, False, {}
+        return self.look(), reward, self._left == 0, False, {}
 
 
 class ToyPolicy:
@@ -64,47 +68,34 @@ class ToyPolicy:
 class Toy(Task):
     name = TOY
     world = World(Continuous.between([-1.0] * 8, [1.0] * 8))
-    seconds = 0.0
+    environment, policy, seconds = ToyEnvironment, ToyPolicy, 0.0
 
     def make_environment(self, assignment):
-        return ToyEnvironment(self.seconds)
+        return self.environment(self.seconds)
 
     def make_policy(self, assignment):
-        return ToyPolicy()
+        return self.policy()
 
 
 class SlowToy(Toy):
     """An episode takes about a third of a second."""
 
-    name = SLOW_TOY
     seconds = 0.03
 
 
 class SecondToy(Toy):
     """An episode takes a second."""
 
-    name = SECOND_TOY
     seconds = 0.1
 
 
 class Rounded(Toy):
     """Rewards differ in the last bit between hosts."""
 
-    name = ROUNDED
-
     def make_environment(self, assignment):
         made = super().make_environment(assignment)
         odd = np.finfo(np.float64).eps if ROUNDING in os.environ else 0.0
         return gymnasium.wrappers.TransformReward(made, lambda reward: reward * (1 - odd))
-
-
-class Brittle(Toy):
-    """A tenth of the episodes raises by parameters and seed; one seed in 20 raises for all parameters."""
-
-    name = BRITTLE
-
-    def make_environment(self, assignment):
-        return BrittleEnvironment()
 
 
 class BrittleEnvironment(ToyEnvironment):
@@ -117,6 +108,12 @@ class BrittleEnvironment(ToyEnvironment):
         if self._left == 7 and (self._is_barred or word < 26):
             raise ArithmeticError(f"the world of {id(self)} is brittle")
         return super().step(action)
+
+
+class Brittle(Toy):
+    """A tenth of the episodes raises by parameters and seed; one seed in 20 raises for all parameters."""
+
+    environment = BrittleEnvironment
 
 
 class Misbehaving(Toy):
@@ -136,14 +133,11 @@ class MisbehavingPolicy(ToyPolicy):
 
 
 class Raising(Misbehaving):
-    name = RAISING
-
     def misbehave(self):
         raise RuntimeError("the road has ended")
 
 
 class Crashing(Misbehaving):
-    name = CRASHING
     probe_steps = 0
 
     def misbehave(self):
@@ -151,7 +145,6 @@ class Crashing(Misbehaving):
 
 
 class Hanging(Misbehaving):
-    name = HANGING
     probe_steps = 0
 
     def misbehave(self):
@@ -161,7 +154,6 @@ class Hanging(Misbehaving):
 class Silent(Misbehaving):
     """Closes every connection of its process, and runs on."""
 
-    name = SILENT
     probe_steps = 0
 
     def misbehave(self):
@@ -172,31 +164,9 @@ class Silent(Misbehaving):
 class Chatty(Misbehaving):
     """Prints more than a pipe holds, on both streams."""
 
-    name = CHATTY
-
     def misbehave(self):
         for stream in (sys.stdout, sys.stderr):
             print("look, " * 10_000, file=stream, flush=True)
-
-
-class SideBySide(Toy):
-    """A slot drives up to four episodes at once."""
-
-    batch_size = 4
-
-    def make_policy(self, assignment):
-        return SideBySidePolicy()
-
-
-class SideBySidePolicy(ToyPolicy):
-    def side_by_side(self):
-        return ToyPolicies()
-
-
-class OneByOne(Toy):
-    """A slot takes one job after the other, whatever `batch_size` says: the policy is for one episode."""
-
-    batch_size = 4
 
 
 class ToyPolicies:
@@ -213,11 +183,21 @@ class ToyPolicies:
         self._actions = self._actions[rows]
 
 
-class Nan(Toy):
-    name = NAN
+class SideBySidePolicy(ToyPolicy):
+    def side_by_side(self):
+        return ToyPolicies()
 
-    def make_policy(self, assignment):
-        return NanPolicy()
+
+class SideBySide(Toy):
+    """A slot drives up to four episodes at once."""
+
+    batch_size, policy = 4, SideBySidePolicy
+
+
+class OneByOne(Toy):
+    """A slot takes one job after the other, whatever `batch_size` says: the policy is for one episode."""
+
+    batch_size = 4
 
 
 class NanPolicy(ToyPolicy):
@@ -225,10 +205,12 @@ class NanPolicy(ToyPolicy):
         self._action = np.full(8, np.nan)
 
 
+class Nan(Toy):
+    policy = NanPolicy
+
+
 class Judged(Toy):
     """Has a judge that differs from its environment."""
-
-    name = JUDGED
 
     def make_evaluation_environment(self, assignment):
         return gymnasium.wrappers.TransformReward(self.make_environment(assignment), lambda reward: reward + 100)
@@ -240,7 +222,6 @@ class Counted(Toy):
     A test can request an odd reward for one episode.
     """
 
-    name = COUNTED
     probe_steps = 0
     seconds = 0.001
 
@@ -251,7 +232,6 @@ class Counted(Toy):
 class Wide(Counted):
     """A slot scores 256 episodes at once."""
 
-    name = f"{MODULE}:Wide"
     batch_size = 256
     seconds = 0.0
 
@@ -311,38 +291,17 @@ class CountedEnvironment(ToyEnvironment):
         return seen, reward if self._odd is None else self._odd, *rest
 
 
-class Heavy(Toy):
-    """Observations do not compress: a kept drive takes a megabyte."""
-
-    name = HEAVY
-
-    def make_environment(self, assignment):
-        return HeavyEnvironment()
-
-
 class HeavyEnvironment(ToyEnvironment):
     observation_space = spaces.Box(0, 255, (100_000,), np.uint8)
 
-    def reset(self, *, seed=None, options=None):
-        _, info = super().reset(seed=seed)
-        return self._look(), info
-
-    def step(self, action):
-        _, *rest = super().step(action)
-        return self._look(), *rest
-
-    def _look(self):
+    def look(self):
         return self.np_random.integers(0, 256, 100_000, np.uint8)
 
 
-class OnTorch(Toy):
-    """A slot scores 256 episodes at once, and 8 on a torch device; each is worth 1."""
+class Heavy(Toy):
+    """Observations do not compress: a kept drive takes a megabyte."""
 
-    name = f"{MODULE}:OnTorch"
-    batch_size, torch_batch_size = 256, 8
-
-    def make_batch(self, assignment):
-        return OnesBatch()
+    environment = HeavyEnvironment
 
 
 class OnesBatch:
@@ -351,13 +310,13 @@ class OnesBatch:
         return [Score(1.0, 1)] * len(episodes)
 
 
-class Exploding(Toy):
-    """A slot scores episodes together; rewards are finite, but their mean overflows."""
+class OnTorch(Toy):
+    """A slot scores 256 episodes at once, and 8 on a torch device; each is worth 1."""
 
-    name = EXPLODING
+    batch_size, torch_batch_size = 256, 8
 
     def make_batch(self, assignment):
-        return ExplodingBatch()
+        return OnesBatch()
 
 
 class ExplodingBatch:
@@ -366,37 +325,25 @@ class ExplodingBatch:
         return [Score(1.7e308, 10) for _ in episodes]
 
 
-class Painted(Toy):
-    """Observes pictures whose colour is the step number; an episode has `length` slow steps."""
+class Exploding(Toy):
+    """A slot scores episodes together; rewards are finite, but their mean overflows."""
 
-    name = PAINTED
-    seconds = 0.02
-    length = 50
-
-    def make_environment(self, assignment):
-        return PaintedEnvironment(self.seconds, self.length)
+    def make_batch(self, assignment):
+        return ExplodingBatch()
 
 
 class PaintedEnvironment(ToyEnvironment):
-    observation_space = spaces.Box(0, 255, (16, 24, 3), np.uint8)
+    observation_space, length = spaces.Box(0, 255, (16, 24, 3), np.uint8), 50
 
-    def __init__(self, seconds, length):
-        super().__init__(seconds)
-        self._length = length
+    def look(self):
+        return np.full((16, 24, 3), (self.length - self._left) % 256, np.uint8)
 
-    def reset(self, *, seed=None, options=None):
-        _, info = super().reset(seed=seed)
-        self._left = self._length
-        return self._look(), info
 
-    def step(self, action):
-        _, *rest = super().step(action)
-        return self._look(), *rest
+class Painted(Toy):
+    """Observes pictures whose colour is the step number; an episode has 50 slow steps."""
 
-    def _look(self):
-        return np.full((16, 24, 3), (self._length - self._left) % 256, np.uint8)
+    environment, seconds = PaintedEnvironment, 0.02
 
 
 def steps_made(folder):
-    """The steps of all processes."""
     return sum(int.from_bytes(path.read_bytes(), "little") for path in Path(folder).iterdir())

@@ -7,7 +7,6 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-STEP_SECONDS = "DREAMFLEET_WEEKEND_STEP"  # seconds of a step; they change no bit
 PARTS = 2000  # of the unit interval that an episode's fate is drawn from
 
 
@@ -26,8 +25,6 @@ class WeekendEnvironment(gymnasium.Env):
 
     def step(self, action):
         self._steps += 1
-        if seconds := float(os.environ.get(STEP_SECONDS, "0")):
-            time.sleep(seconds)
         reward = -float(((action - self._target) ** 2).sum())
         if self._steps == 3:
             reward = self._fail(action, reward)

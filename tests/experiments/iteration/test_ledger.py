@@ -8,8 +8,7 @@ import pytest
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.experiments.iteration.config import IterateConfig
 from dreamfleet.experiments.iteration.ledger import Artefact, IterationLedger
-from tests.support.ledgers import RUN, entry, ledger
-from tests.support.phase_requests import requests
+from tests.support.ledgers import RUN, entry, ledger, requests
 
 
 def kept(written, folder):

@@ -7,8 +7,7 @@ import pytest
 from dreamfleet.common.errors import UsageError
 from dreamfleet.experiments.iteration.config import IterateConfig
 from dreamfleet.experiments.iteration.plan import Phase
-from tests.support.ledgers import entry
-from tests.support.phase_requests import requests
+from tests.support.ledgers import entry, requests
 
 ROUND_2 = (entry(1, "collect", episodes=620), entry(1, "bundle"), entry(1, "evolve"))
 GATED = (*ROUND_2, entry(2, "bundle"))

@@ -5,7 +5,7 @@ import pytest
 
 from dreamfleet.worker.addons.task_check import FaultError, dry_run
 from dreamfleet.worker.tasks import closing
-from tests.support.strict_environments import ACTIONS, STRICT
+from tests.support.environments import ACTIONS, STRICT
 from tests.support.stuck_environments import MODULE
 
 

@@ -97,17 +97,6 @@ def test_a_viewer_sees_the_running_job_and_its_observation(stage, hand, cached, 
 
 
 @pytest.mark.slow
-def test_frames_do_not_restart_the_coordinators_silence(stage, cached, viewer):
-    """A worker that has results without a verdict says hello again after five silent beats, watched or not."""
-    hand, *_ = stage.served(tasks.PAINTED)
-    watching = viewer(hand)
-    hand.send(1, *(hand.job(episode) for episode in range(8)))
-    hand.result(hand.job(0))  # without a verdict
-    hand.hello()
-    watching.frame()
-
-
-@pytest.mark.slow
 def test_after_a_slot_was_killed_in_the_middle_the_next_child_is_watched(stage, hand, cached, viewer):
     stage.worker()
     hand.ready()

@@ -61,15 +61,6 @@ def test_it_looks_for_its_run_in_intervals_while_no_coordinator_is_in_sight():
     assert member.start_search_if_due(1e6 + 2 * SEARCH_INTERVAL)
 
 
-def test_it_drains_at_the_end_of_its_lifetime_which_begins_before_any_run():
-    member = Membership(LeaveConditions(lifetime=10.0), now=0.0)
-    assert not member.is_leaving(9.9)
-    assert member.is_leaving(10.0)
-    member.join("first", BEAT, now=9.0)
-    assert not member.start_draining_if_due(9.9)
-    assert member.start_draining_if_due(10.0)
-
-
 def test_it_drains_once_its_join_file_ends_by_the_wall_clock_however_little_time_it_was_awake():
     left = [1.0]
     member = joined(is_expired=lambda: left[0] <= 0)

@@ -1,6 +1,8 @@
-"""Environments that take no long seeds, and those whose resets fail for another reason."""
+"""Environments that take no long seeds, and those whose `reset` or `close` misbehaves. Tests closing.py."""
 
+import signal
 from contextlib import suppress
+from time import monotonic
 
 import gymnasium
 import numpy as np
@@ -8,7 +10,10 @@ import pytest
 from gymnasium import spaces
 
 from dreamfleet.common.runs.seeds import fold_seed, training_seed
+from dreamfleet.worker.tasks import closing
+from dreamfleet.worker.tasks.closing import close_environment
 from dreamfleet.worker.tasks.reset import reset_folded
+from tests.support.stuck_environments import StuckClose
 
 LONG, LONGEST = training_seed(7, 0, 0), 2**53 - 1
 
@@ -60,3 +65,26 @@ def test_a_reset_that_fails_by_chance_is_an_error_and_no_other_seed(error):
                 assert reset_folded(environment, LONG + each)[0] == LONG + each
                 found.append(each)
         assert 2 <= len(found) <= 10
+
+
+def test_a_close_that_hangs_is_interrupted_and_not_called_again_and_another_is_whose_interrupt_passes(
+    monkeypatch, caplog
+):
+    class Interrupted(StuckClose):
+        def close(self):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(closing, "CLOSE_LIMIT", 0.2)
+    monkeypatch.setattr(closing, "_hung", {})
+    StuckClose.calls.clear()
+    before, began = signal.getsignal(signal.SIGALRM), monotonic()
+    fault = close_environment(StuckClose())
+    assert StuckClose.__name__ in fault
+    assert caplog.messages == [fault]
+    assert close_environment(StuckClose()) == fault
+    assert monotonic() - began < 60
+    assert len(StuckClose.calls) == 1
+    assert signal.getsignal(signal.SIGALRM) == before
+    assert signal.getitimer(signal.ITIMER_REAL) == (0, 0)
+    with pytest.raises(KeyboardInterrupt):
+        close_environment(Interrupted())

@@ -13,13 +13,10 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import ControllerError, DatasetError, UsageError
-from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.addons.refit.fit_subspace import find_subspace, make_targets
 from dreamfleet.worker.addons.refit.refit import output_bounds, output_names, refit
-from dreamfleet.worker.dream.world import DreamWorld
 from dreamfleet.worker.scoring.rollout import DataWorld
-from dreamfleet.worker.scoring.scorer import Scorer
-from dreamfleet.worker.training import train_mdnrnn, train_vae
+from dreamfleet.worker.training import train_vae
 from dreamfleet.worker.training.assemble import assemble
 from dreamfleet.worker.training.data.collect import collect
 from dreamfleet.worker.training.data.collect_config import CollectConfig
@@ -28,8 +25,8 @@ from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
-from tests.support.bundles import write_random_bundle
-from tests.support.drives import grey, ignore, write_drive
+from tests.support.bundles import write_random_bundle, write_world_bundle
+from tests.support.drives import grey, ignore, train_models, write_drive
 from tests.support.pixel_world import DODGE_TASK, DodgeTask
 
 DRIVES, STATES = 24, 30
@@ -45,14 +42,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("dodge")
     config = CollectConfig(episodes=DRIVES, steps=60, anywhere=0.0, patience=0, driver="held")
     assert len(list(collect(folder, config, 1, world=DataWorld(DODGE_TASK)))) == DRIVES
-    train(folder)
-    return folder
-
-
-def train(folder, **more):
-    train_vae.train_vae(folder, replace(FEW, **more), ignore, EYES, new=True)
-    assert len(list(encode(folder))) == DRIVES
-    train_mdnrnn.train_mdnrnn(folder, replace(FEW, **more), ignore, MEMORY, new=True)
+    return train_models(folder, FEW, EYES, MEMORY)
 
 
 @pytest.fixture(scope="module")
@@ -121,24 +111,9 @@ def test_up_to_half_of_the_recorded_states_lie_before_deaths(folder, bundle):
     assert bundle.manifest.provenance["recorded"] == {"states": STATES, "before_losses": min(late, STATES // 2)}
 
 
-def test_a_controller_drives_by_it_in_the_world_and_in_its_dream(bundle):
-    parameters = np.random.default_rng(0).normal(size=bundle.controller_shape.size).astype(np.float32)
-    scorer = Scorer(TaskSpec(DODGE_TASK, bundle.sha256, horizon=60, patience=0), bundle)
-    score = scorer.score("score", parameters, 3)
-    assert score.fitness == score.steps > 0
-    dream = Scorer(TaskSpec("dream", bundle.sha256, horizon=60, patience=0, recorded=0.5), bundle)
-    together = dream.score_all([("score", parameters, seed) for seed in (1, 2, 3)], ignore)
-    assert together[1] == dream.score("score", parameters, 2)
-    for each in together:
-        assert each.fitness in (each.steps, each.steps - 1), "the last step of a life pays nothing"
-    assert DreamWorld(bundle, 1.0).bars is not None, "its ends are drawn"
-
-
 @pytest.mark.parametrize("hidden", [0, 5])
 def test_a_controller_is_fitted_to_another_model_of_the_world(folder, bundle, tmp_path, hidden):
-    shutil.copytree(folder / "episodes", tmp_path / "episodes")
-    train(tmp_path, seed=1)
-    other = assemble(tmp_path, tmp_path / "other.zip", "other", with_weights=False)
+    other = write_world_bundle(tmp_path / "other.zip", bundle.manifest.world, seed=1, vae=EYES, rnn=MEMORY)
     shape = bundle.shape_of("zh", hidden)
     drawn = np.random.default_rng(3).normal(size=shape.size).astype(np.float32)
     before = Controller(shape, drawn, DODGE_TASK, bundle.sha256)

@@ -24,13 +24,11 @@ from dreamfleet.worker.worldmodel.inference import DreamStep, Encoder, PolicySte
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import npy, parts_of
-from tests.support.drives import ignore, train_models, write_drives
+from tests.support.drives import ignore, train_models, write_drive, write_drives
 from tests.support.models import random_models, weights
 
 LAYERS, RNN = VAEConfig(latent=4, channels=(4, 4, 8, 8)), MDNRNNConfig(latent=4, hidden=8, mixtures=2)
 SHORT = TrainConfig(updates=2, batch=8, rate=1e-3)
-
-
 WHOLE = {INITIAL_LATENTS_PART: np.zeros((4, 2, 32), np.float32), RECORDED_STATES: np.zeros((4, 576), np.float16)}
 
 
@@ -125,6 +123,18 @@ def test_an_mdnrnn_of_other_latents_is_refused(folder):
     (folder / train_mdnrnn.CHECKPOINT).unlink()
     with pytest.raises(DatasetError):
         train_mdnrnn.train_mdnrnn(folder, SHORT, ignore, replace(RNN, latent=5))
+
+
+def test_a_vae_of_another_size_than_the_data_is_refused_before_anything_runs(folder):
+    shutil.rmtree(folder / "encoded")
+    checkpoint = (folder / train_vae.CHECKPOINT).read_bytes()
+    with pytest.raises(DatasetError, match=r"'box-64'.*'raw-96'.*--picture"):
+        train_vae.train_vae(folder, SHORT, ignore, replace(LAYERS, picture=96), new=True)
+    assert (folder / train_vae.CHECKPOINT).read_bytes() == checkpoint
+    write_drive(folder, 4, picture=96)
+    with pytest.raises(DatasetError, match=r"000004.npz.*'raw-96'"):
+        list(encode(folder))
+    assert not (folder / "encoded").exists()
 
 
 def test_data_that_are_no_numbers_stop_training_and_keep_the_checkpoint(folder):

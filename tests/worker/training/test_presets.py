@@ -19,8 +19,8 @@ from dreamfleet.worker.training.data.rollouts import Rollouts, load_rollouts, mo
 from dreamfleet.worker.training.presets import PRESETS, TrainConfig
 from dreamfleet.worker.verbs import collect, train
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
-from dreamfleet.worker.worldmodel.mdnrnn_config import NOTEBOOK, REWARDED, MDNRNNConfig
-from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
+from dreamfleet.worker.worldmodel.mdnrnn_config import NOTEBOOK, MDNRNNConfig
+from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.drives import ignore, train_models, write_drive, write_drives
 from tests.support.events import scalars
 from tests.support.verbs import run_verb
@@ -31,41 +31,6 @@ SMALL = {64: VAEConfig(channels=(2, 2, 4, 4)), 96: VAEConfig(picture=96, channel
 
 def call(folder, verb, *words):
     return run_verb(verb, *words, "--data", folder)
-
-
-def test_tiny_is_what_it_was():
-    tiny = PRESETS["tiny"]
-    assert tiny.collect == CollectConfig(episodes=620, steps=300, anywhere=0.6, patience=120, driver="random")
-    assert tiny.vae == TrainConfig(updates=1500, batch=100, rate=5e-4, clip=0)
-    assert tiny.mdnrnn == TrainConfig(updates=800, batch=32, rate=1e-3)
-    assert (tiny.vae_layers, tiny.mdnrnn_layers) == (PAPER, REWARDED)
-
-
-@pytest.mark.parametrize(
-    ("name", "drives"),
-    [("notebook", (1000, 300, "uniform")), ("article", (2000, 300, "pushed")), ("paper", (10_000, 1000, "network"))],
-)
-def test_a_sources_drives_begin_at_the_tracks_beginning_and_last_their_steps(name, drives):
-    found = PRESETS[name].collect
-    assert (found.episodes, found.steps, found.driver) == drives
-    assert (found.anywhere, found.patience, PRESETS[name].vae.rate) == (0, 0, 1e-4)
-
-
-def test_the_notebooks_trainings_end_with_their_last_update():
-    notebook = PRESETS["notebook"]
-    assert (notebook.vae.updates, notebook.mdnrnn.updates) == (30_000, 10_000)
-    assert (notebook.vae.patience, notebook.mdnrnn.patience) == (0, 0)
-    assert (notebook.mdnrnn_layers.z_factor, notebook.mdnrnn_layers.reward_factor) == (1, 1)
-    assert notebook.mdnrnn_layers.reward == "notebook"
-    assert PRESETS["attentive"].collect.steps == 384
-
-
-@pytest.mark.add_on
-def test_take_covers_models_predict_no_reward_and_weigh_its_ends_and_small_things():
-    preset = PRESETS["takecover"]
-    assert (preset.task, preset.collect.driver, preset.mdnrnn_layers.outputs) == ("takecover", "held", 961)
-    assert (preset.vae_layers.pixel_weight, preset.mdnrnn_layers.done_weight) == (3, 3)
-    assert preset.collect.steps == 525  # decisions of 4 tics, 2,100 tics
 
 
 def test_every_preset_is_named_for_both_sides_has_a_world_and_records_what_its_vae_sees():
@@ -158,14 +123,6 @@ def test_a_data_set_has_one_preset_and_one_seed(tmp_path):
         check_seed(tmp_path, 7)
     (tmp_path / "preset.json").write_text('{"preset": "paper", "task": "car-racing"}')  # no seed is kept
     check_seed(tmp_path, 7)
-
-
-def test_flags_change_what_a_preset_says(tmp_path, capsys):
-    write_drives(tmp_path, episodes=3, steps=4)
-    changes = ("--set", "channels=2,2,4,4", "batch_norm=false", "--set", "padding=same")
-    call(tmp_path, train, "vae", "--updates", 1, *changes)
-    assert load_config(tmp_path / "vae.safetensors", VAEConfig) == VAEConfig(channels=(2, 2, 4, 4), padding="same")
-    assert "reconstruction_error" in capsys.readouterr().out
 
 
 def test_a_flag_says_how_large_pictures_are(tmp_path, capsys):

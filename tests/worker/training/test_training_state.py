@@ -1,7 +1,8 @@
 """A training that is interrupted, killed, or out of disk space resumes to the same bits.
-Tests training_state.py, checkpoint.py and worker/training/stages/train.py."""
+Tests training_state.py, torch_setup.py, checkpoint.py and worker/training/stages/train.py."""
 
 import json
+import os
 import shutil
 import signal
 from dataclasses import replace
@@ -16,7 +17,7 @@ from safetensors.torch import load_file, save_file
 from dreamfleet.common.errors import DatasetError, StoppedError, UsageError
 from dreamfleet.common.files.locks import folder_lock
 from dreamfleet.common.host.stop_signals import stop_on_signals
-from dreamfleet.worker.training import checkpoint, train_mdnrnn, train_vae, training_state
+from dreamfleet.worker.training import checkpoint, torch_setup, train_mdnrnn, train_vae, training_state
 from dreamfleet.worker.training.assemble import QUALITY, assemble, load_quality, record_quality
 from dreamfleet.worker.training.checkpoint import load_checkpoint, load_progress, load_weights
 from dreamfleet.worker.training.data.rollouts import load_rollouts
@@ -279,13 +280,6 @@ def test_a_stopped_training_keeps_every_update_and_resumes_to_the_same_bits(driv
     assert state(data / train_vae.CHECKPOINT) == state(drives / train_vae.CHECKPOINT)
 
 
-def test_a_stopped_mdnrnn_resumes_to_the_same_bits(drives, encoded, tmp_path):
-    whole, done = train_memory(linked(drives, tmp_path / "whole", *ENCODED)), []
-    with pytest.raises(StoppedError):
-        train_memory(encoded, report=lambda number, _: done.append(number), stop=lambda: done[-1] == 3)
-    assert state(train_memory(encoded)) == state(whole)
-
-
 def test_a_decoder_that_learns_on_leaves_latents_and_mdnrnn_as_they_are(drives, tmp_path):
     before, folder = load_weights(drives / train_vae.CHECKPOINT), shutil.copytree(drives, tmp_path / "data")
     train_memory(folder)
@@ -388,3 +382,39 @@ def test_a_device_that_is_not_there_is_refused():
     assert select_device("auto").type in ("cpu", "cuda")
     with pytest.raises(UsageError):
         select_device("abacus")
+
+
+@pytest.fixture
+def allocator_calls(monkeypatch):
+    """The calls of the C library's allocator settings."""
+    calls = []
+    for name in [each for each in os.environ if each.startswith(("MALLOC_", "OMP_WAIT"))]:
+        monkeypatch.delenv(name)
+    monkeypatch.setattr(torch_setup, "_keep_freed_memory", lambda: calls.append("keep"))
+    yield calls
+    os.environ.pop("OMP_WAIT_POLICY", None)
+
+
+def test_threads_that_wait_sleep_and_the_heap_keeps_what_is_freed(allocator_calls):
+    torch_setup.configure_process()
+    assert (os.environ["OMP_WAIT_POLICY"], allocator_calls) == ("PASSIVE", ["keep"])
+
+
+def test_what_the_user_set_stays(allocator_calls, monkeypatch):
+    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    monkeypatch.setenv("MALLOC_ARENA_MAX", "2")
+    torch_setup.configure_process()
+    assert (os.environ["OMP_WAIT_POLICY"], allocator_calls) == ("ACTIVE", [])
+
+
+def test_a_system_without_such_a_heap_is_left_alone(monkeypatch):
+    asked = []
+
+    class Library:
+        def __getattr__(self, name):
+            asked.append(name)
+            raise AttributeError(name)
+
+    monkeypatch.setattr(torch_setup.ctypes, "CDLL", lambda _name: Library())
+    torch_setup._keep_freed_memory()
+    assert asked == ["mallopt"]

@@ -15,6 +15,10 @@ SHARED = tuple(Path("/dev/shm", name) for name in ("ViZDoomSM", "ViZDoomMQCtr", 
 scenarios_path = str(Path(__file__).parent)
 ScreenResolution = SimpleNamespace(RES_160X120=(120, 160))
 ScreenFormat = SimpleNamespace(RGB24="RGB24")
+SET = {
+    "set_doom_skill": 4, "set_living_reward": 1, "set_window_visible": False, "set_render_hud": False,
+    "set_screen_resolution": ScreenResolution.RES_160X120, "set_screen_format": ScreenFormat.RGB24,
+}  # fmt: skip
 
 
 class CrashError(Exception):
@@ -27,23 +31,14 @@ class DoomGame:
     def load_config(self, path):
         assert Path(path).name == "take_cover.cfg"
 
-    def set_doom_skill(self, skill):
-        assert skill == 4
+    def __getattr__(self, name):
+        """A setter that takes one value alone."""
+        expected = SET[name]
 
-    def set_living_reward(self, reward):
-        assert reward == 1
+        def check(value):
+            assert value == expected
 
-    def set_window_visible(self, visible):
-        assert not visible
-
-    def set_screen_resolution(self, resolution):
-        assert resolution == ScreenResolution.RES_160X120
-
-    def set_screen_format(self, kind):
-        assert kind == ScreenFormat.RGB24
-
-    def set_render_hud(self, shown):
-        assert not shown
+        return check
 
     def set_vizdoom_path(self, path):
         self._path = path

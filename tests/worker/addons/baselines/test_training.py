@@ -13,7 +13,7 @@ from dreamfleet.common.errors import DatasetError, StoppedError, UsageError
 from dreamfleet.worker.addons.baselines import train
 from dreamfleet.worker.addons.baselines import verb as baseline
 from dreamfleet.worker.addons.baselines.network import Networks, QPolicy
-from dreamfleet.worker.addons.baselines.presets import LEARNING, NOTEBOOK, AgentConfig, LearningConfig
+from dreamfleet.worker.addons.baselines.presets import AgentConfig, LearningConfig
 from dreamfleet.worker.addons.baselines.train import CHECKPOINT, CURVE, episode_file, train_drqn
 from dreamfleet.worker.tasks.model_free_policies import NO_PARAMETERS
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights, save_checkpoint
@@ -123,16 +123,6 @@ def test_flags_change_what_a_preset_says(tmp_path, capsys):
         call("drqn", "--data", tmp_path, *FLAGS, "--episodes", 3)
     with pytest.raises(UsageError, match="`dreamfleet evaluate --controller random-discrete`"):
         call("random-discrete", "--data", tmp_path)
-
-
-def test_the_notebooks_settings_are_as_they_were():
-    learning, agent = NOTEBOOK.learning, NOTEBOOK.agent
-    assert (learning.episodes, learning.random_episodes, learning.batch, learning.gamma) == (500, 50, 64, 0.99)
-    assert (learning.epsilon_first, learning.epsilon_last, learning.goal, learning.report_every) == (0.6, 0.1, 900, 5)
-    assert (learning.trace, learning.burn_in, learning.n_step, learning.loss) == (1, 0, 1, "squared")
-    assert agent.table == ((0, 0, 0), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, 0, 1))
-    assert (LEARNING.learning.loss, LEARNING.agent.heads) == ("huber", "linear")
-    assert LEARNING.agent.table[1] == (0.6, 0, 0)
 
 
 def test_a_damaged_or_missing_file_is_one_line(whole, tmp_path):

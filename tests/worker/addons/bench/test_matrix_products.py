@@ -1,14 +1,19 @@
 """The lower bounds of `lab bench policy` and `lab bench dream` ignore slow libraries and inherited settings.
-Tests measurement.py and verb.py."""
+Its peers may do what they like. Tests dispatch.py, measurement.py, simulated_workers.py, sleep_tasks.py and verb.py."""
 
 import os
+import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
 from dreamfleet.common.host.resource_limits import POOLS
+from dreamfleet.worker.addons.bench import dispatch
 from dreamfleet.worker.addons.bench.matrix_products import LIBRARIES, fastest, product_cases, product_graph
+from dreamfleet.worker.addons.bench.sleep_tasks import HALF_SECOND_TASK, NULL_TASK, SLEEP_TASK
 from dreamfleet.worker.addons.bench.verb import measure_on_one_thread
+from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worldmodel.inference import open_graph
 
 
@@ -48,3 +53,34 @@ def test_the_runtimes_product_is_one(left, right):
     first, second = (random.normal(size=shape).astype(np.float32) for shape in (left, right))
     (product,) = open_graph(product_graph(left, second), threads=1).run(["out"], {"left": first})
     assert np.allclose(product, first @ second, atol=1e-5)
+
+
+@contextmanager
+def hanging():
+    yield lambda _work, _count: time.sleep(3600)
+
+
+@contextmanager
+def failing():
+    raise RuntimeError("not today")
+    yield
+
+
+@contextmanager
+def prompt():
+    yield lambda work, count: [work(index) for index in range(min(count, 2))]
+
+
+def test_a_peer_is_measured_in_a_process_of_its_own():
+    assert dispatch.run_peer(prompt).keys() == {"efficiency_50ms", "null_jobs_per_second"}
+
+
+def test_a_peer_that_hangs_or_fails_has_no_figures(monkeypatch):
+    assert dispatch.run_peer(failing) is None
+    monkeypatch.setattr(dispatch, "PEER_SECONDS", 1.0)
+    assert dispatch.run_peer(hanging) is None
+
+
+@pytest.mark.parametrize("name", [SLEEP_TASK, NULL_TASK, HALF_SECOND_TASK])
+def test_a_worker_finds_its_tasks_by_name(name):
+    assert find_task(name).name == name

@@ -1,6 +1,10 @@
 """World models whose encoder and LSTM multiply eight-bit integers.
 Tests worker/worldmodel/eight_bits.py and worker/worldmodel/onnx_graph.py."""
 
+import os
+import platform
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -202,3 +206,29 @@ def test_flags_that_do_not_fit_are_refused(more, flag, capsys, tmp_path, monkeyp
     assert main(["bundle", "--from", "tiny", *more]) == 2
     assert flag in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+PROGRAM = """
+import sys
+from dreamfleet import Scorer, TaskSpec, find_bundle, find_controller
+bundle = find_bundle(sys.argv[1])
+for task in ("car-racing", "dream"):
+    scorer = Scorer(TaskSpec(task, bundle.sha256, horizon=20, patience=0), bundle)
+    print(task, scorer.host_class, scorer.score("score", find_controller("tiny").parameters, seed=2**20))
+"""
+
+
+def output_of(bundle, *emulator):
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "SDL_VIDEODRIVER": "dummy"}
+    command = [*emulator, os.path.realpath(sys.executable), "-W", "ignore", "-c", PROGRAM, str(bundle.path)]
+    return subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.splitlines()
+
+
+@pytest.mark.slow
+@pytest.mark.needs_programs("qemu-x86_64")
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="emulates another x86 processor")
+def test_class_and_score_are_those_of_a_processor_without_avx512(tmp_path):
+    rounded = write_eight_bit_bundle(find_bundle("tiny"), tmp_path / "rounded.zip")
+    here = output_of(rounded)
+    assert [line.split()[0] for line in here] == ["car-racing", "dream"]
+    assert output_of(rounded, "qemu-x86_64", "-cpu", "Haswell") == here

@@ -1,6 +1,7 @@
 """Tests loop.py, drive_window.py and picture_window.py."""
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import pygame
@@ -11,6 +12,8 @@ from dreamfleet.common.errors import NoDisplayError, UsageError
 from dreamfleet.worker.addons.driving.drive_window import BACKGROUND, DriveWindow, Pedals
 from dreamfleet.worker.addons.driving.loop import DreamScene, DrivingConfig, drive, make_scene
 from dreamfleet.worker.addons.driving.picture_window import PictureWindow
+from dreamfleet.worker.worldmodel.vae_config import PAPER
+from tests.support.bundles import write_random_bundle
 
 SEED = 20_003
 
@@ -99,6 +102,13 @@ def test_the_dream_is_shown_with_hard_pixels_and_its_score_below():
         assert pygame.display.get_caption()[0] == "dreamfleet: a dream, over"
         written = pygame.mask.from_threshold(shown.subsurface((0, 800, 800, 64)), (235, 235, 235), (9, 9, 9))
         assert written.count() > 100
+
+
+@pytest.mark.parametrize("picture", [64, 96])
+def test_a_dream_is_driven_at_one_size_whatever_its_model_sees(tmp_path, picture):
+    scene = DreamScene(write_random_bundle(tmp_path / "b.zip", vae=replace(PAPER, picture=picture)), 1.0, 5)
+    scene.environment.reset(seed=1)
+    assert [side * scene.scale for side in scene.surface().get_size()] == [640, 640]
 
 
 def test_the_longest_text_fits_the_narrowest_window():

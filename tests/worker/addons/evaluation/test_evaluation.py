@@ -1,14 +1,21 @@
-"""Tests evaluation.py, evaluation_report.py, agents.py, verb.py and worker/addons/verification/report_verb.py."""
+"""Tests evaluation.py, evaluation_report.py, agents.py, predictor.py, verb.py,
+worker/addons/verification/report_verb.py and dreamfleet/experiments/controllers.py."""
 
 import json
 import os
+import pickle
 import re
 import signal
+import subprocess
+import sys
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import dreamfleet
+from dreamfleet import make_environment, make_policy
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
@@ -30,7 +37,7 @@ from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition
 from dreamfleet.worker.tasks.api import Score, World
 from dreamfleet.worker.tasks.registry import find_task
 from tests.support import rough_tasks, tasks
-from tests.support.processes import call_here
+from tests.support.processes import DEADLINE, call_here, environment
 from tests.support.variants import controller_of
 
 SEEDS = (10_000, 10_001, 10_002)
@@ -97,8 +104,7 @@ def test_an_episode_that_fails_is_reported_and_the_others_go_on(words, random_bu
 
 
 @pytest.mark.parametrize(
-    ("task", "error"),
-    [(tasks.NAN, "ValueError"), (RAISING, "KeyboardInterrupt"), (RAISING, "GeneratorExit")],
+    ("task", "error"), [(tasks.NAN, "ValueError"), (RAISING, "KeyboardInterrupt"), (RAISING, "GeneratorExit")]
 )
 def test_an_evaluation_without_any_score_ends_with_one_line(words, monkeypatch, task, error):
     monkeypatch.setenv(rough_tasks.PLACE, "step")
@@ -227,3 +233,72 @@ def test_a_lap_is_finished_if_the_environment_says_so_at_the_end(last, finished)
         watch.on_transition(moment(info))
     drive = watch.drive(1, Score(900.0, 2))
     assert (drive.finished, drive.speed, drive.braking) == (finished, 30.0, 0.0)
+
+
+POLE = Controller(ControllerShape(4, 2), np.arange(10, dtype=np.float32), "gym:CartPole-v1", "")
+PICTURES = np.random.default_rng(1).integers(0, 256, (6, 64, 64, 3), dtype=np.uint8)
+
+
+def test_it_acts_as_the_policy_does_in_an_episode():
+    controller = dreamfleet.find_controller("tiny")
+    policy, drive = make_policy(controller), make_environment(controller)
+    observation, _ = drive.reset(seed=5)
+    state = reward = None
+    for _ in range(12):
+        action, state = controller.predict(observation, state, reward=reward)
+        assert np.array_equal(action, policy.act(observation))
+        observation, reward, *_ = drive.step(action)
+        policy.reward(reward)
+    drive.close()
+
+
+def test_a_state_is_a_value_that_can_be_used_again():
+    controller = dreamfleet.find_controller("tiny")
+    states, actions = [None], []
+    for picture in PICTURES:
+        action, state = controller.predict(picture, states[-1])
+        states.append(state)
+        actions.append(action)
+    for number in (4, 1, 0, 5):  # in any order
+        kept = deepcopy(states[number])
+        action, state = controller.predict(PICTURES[number], kept)
+        assert np.array_equal(action, actions[number])
+        assert np.array_equal(state, states[number + 1])
+        assert number == 0 or np.array_equal(kept, states[number])
+    begun, _ = controller.predict(PICTURES[0], states[4], episode_start=True)
+    assert np.array_equal(begun, actions[0])
+
+
+def test_without_a_world_model_it_has_no_state_and_it_can_be_copied_and_pickled_afterwards():
+    assert POLE.predict(np.array([1, 0, 0, 0]), deterministic=True) == (1, None)
+    for other in (pickle.loads(pickle.dumps(POLE)), deepcopy(POLE)):
+        assert other.predict(np.ones(4)) == POLE.predict(np.ones(4))
+
+
+def test_the_state_of_another_controller_is_refused():
+    with pytest.raises(ControllerError, match=r"\(3,\) .*\(1, 512\)"):
+        dreamfleet.find_controller("tiny").predict(PICTURES[0], np.zeros(3))
+    with pytest.raises(ControllerError):
+        POLE.predict(np.ones(4), np.zeros((1, 512)))
+
+
+def test_its_world_model_may_be_given(random_bundle):
+    controller = controller_of(random_bundle)
+    with pytest.raises(BundleError):
+        controller.predict(PICTURES[0])
+    action, _ = controller.predict(PICTURES[0], bundle=random_bundle)
+    assert action.shape == (3,)
+
+
+def test_without_the_packages_of_a_worker_the_error_names_what_to_install(tmp_path):
+    POLE.save(tmp_path / "pole.npz")
+    program = (
+        "import sys; sys.modules['gymnasium'] = None\n"
+        "from pathlib import Path; from dreamfleet import Controller\n"
+        f"Controller.load(Path({str(tmp_path / 'pole.npz')!r})).predict([0, 0, 0, 0])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=environment(tmp_path), capture_output=True, text=True, check=False,
+        timeout=DEADLINE,
+    )  # fmt: skip
+    assert "'dreamfleet[worker]'" in done.stderr

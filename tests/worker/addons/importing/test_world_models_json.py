@@ -13,9 +13,7 @@ from dreamfleet.common.artifacts.onnx_checks import read_float_array
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.worker.addons.importing.json_weights import read_mdnrnn, read_vae
-
-LATENT, HIDDEN, MIXTURES, ACTIONS = 32, 256, 5, 3
-CHANNELS = (3, 32, 64, 128, 256)
+from tests.support.checkpoint_files import ACTIONS, CHANNELS, HIDDEN, LATENT, MIXTURES, sigmoid
 
 
 def whole_numbers(random, *shape, scale):
@@ -78,10 +76,6 @@ def drive_of_theirs(vae, rnn, controller, pictures):
         hidden = np.tanh(cell) * sigmoid(leave)
         actions.append(action)
     return np.array(actions), hidden @ heads
-
-
-def sigmoid(value):
-    return 1 / (1 + np.exp(-value))
 
 
 @pytest.fixture(scope="module")

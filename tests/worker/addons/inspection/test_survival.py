@@ -42,11 +42,7 @@ def dodge(tmp_path_factory):
 def closed(monkeypatch):
     """The environments that were closed."""
     found = []
-
-    def close(environment):
-        found.append(environment)
-
-    monkeypatch.setattr(Dodge, "close", close)
+    monkeypatch.setattr(Dodge, "close", lambda environment: found.append(environment) or None)
     return found
 
 

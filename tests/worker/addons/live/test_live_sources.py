@@ -5,7 +5,6 @@ import io
 import json
 from itertools import islice, takewhile
 
-import av
 import numpy as np
 import pytest
 
@@ -27,32 +26,19 @@ from dreamfleet.worker.scoring.episode import EpisodeConfig
 from dreamfleet.worker.scoring.scorer import Scorer
 from dreamfleet.worker.worldmodel.inference import Decoder
 from tests.support.samples import HEAD
+from tests.support.watching import Watching
 
 SEED = 10_003
 PARAMETERS = np.random.default_rng(0).normal(0, 0.1, 867).astype(np.float32)
 
 
-class Once:
-    """Observes the tenth step."""
-
-    def __init__(self):
-        self.step, self._asked = None, 0
-
-    def is_due(self):
-        self._asked += 1
-        return self._asked == 10
-
-    def observe(self, _episode, look):
-        self.step = look()
-
-
 def live_frame_of(bundle, task, **more):
     """A worker's frame of one step of a task."""
-    scorer, eyes = Scorer(TaskSpec(task, bundle.sha256, 20, 0, temperature=1.0), bundle), Once()
+    scorer, eyes = Scorer(TaskSpec(task, bundle.sha256, 20, 0, temperature=1.0), bundle), Watching(every=10)
     scorer.observer = eyes
     scorer.score("score", PARAMETERS, 2**20)
     scorer.close()
-    seen = eyes.step
+    seen = eyes[0][1]
     picture = (1, 1, b"") if seen.picture is None else pack_picture(seen.picture)
     numbers = [each.astype("<f4").tobytes() for each in (seen.latent, seen.state, PARAMETERS)]
     facts = {
@@ -131,15 +117,6 @@ def test_pictures_are_in_a_folder_with_their_facts(tmp_path):
         f"{number:06d}.{kind}" for number in range(3) for kind in ("json", "png")
     ]
     assert json.loads((tmp_path / "new" / "stills" / "000001.json").read_text()) == {"step": 200}
-
-
-def test_a_video_has_every_picture(tmp_path):
-    with open_sink(str(tmp_path / "live.mp4"), 10, io.BytesIO()) as show:
-        assert all(show(each) for each in PICTURES)
-    with av.open(str(tmp_path / "live.mp4")) as container:
-        stream = container.streams.video[0]
-        assert (stream.codec_context.name, stream.width, stream.height) == ("h264", 60, 40)
-        assert len(list(container.decode(stream))) == 3
 
 
 def test_a_stream_has_every_picture_and_ends_when_its_reader_leaves(tmp_path):

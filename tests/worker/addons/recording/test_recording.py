@@ -1,4 +1,4 @@
-"""Tests recording.py, drive_frames.py and verb.py."""
+"""Tests recording.py, drive_frames.py, video.py and verb.py."""
 
 import json
 import re
@@ -15,8 +15,10 @@ from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.worker.addons.evaluation.agents import make_agent
 from dreamfleet.worker.addons.recording.canvas import DREAMING, Canvas
 from dreamfleet.worker.addons.recording.recording import record, record_in_process
+from dreamfleet.worker.addons.recording.video import Video
 from dreamfleet.worker.scoring import episode
 from dreamfleet.worker.scoring.episode import EpisodeConfig
+from tests.support.disks import small_disk
 from tests.support.processes import call_here
 from tests.support.variants import controller_of
 
@@ -96,11 +98,7 @@ def test_an_environment_that_cannot_be_filmed_ends_with_one_line(tmp_path, monke
 
 @pytest.mark.parametrize(
     ("name", "error"),
-    [
-        ("Breaking", "ZeroDivisionError: no road"),
-        ("Interrupting", "KeyboardInterrupt:"),
-        ("Leaving", "exit status 3"),
-    ],
+    [("Breaking", "ZeroDivisionError: no road"), ("Interrupting", "KeyboardInterrupt:"), ("Leaving", "exit status 3")],
 )
 def test_an_episode_that_fails_leaves_no_video_and_the_one_that_is_there(tmp_path, monkeypatch, name, error):
     dark_controller(name, monkeypatch).save(tmp_path / "breaking.npz")
@@ -179,3 +177,36 @@ def test_an_impossible_place_is_refused(agent, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(DreamfleetError, match="--out"):
         record(agent, SEED, STEPS, tmp_path / "file" / "drive.mp4")
+
+
+NOISE = np.random.default_rng(1).integers(0, 255, (128, 128, 3)).astype(np.uint8)
+
+
+def film(path, pictures, error=None, **more):
+    with Video(path, 10, **more) as video:
+        for _ in range(pictures):
+            video.add(NOISE)
+        if error is not None:
+            raise error
+
+
+@pytest.mark.parametrize("keep_partial", [False, True])
+@pytest.mark.parametrize("pictures", [1, 200])  # written as the video ends, and before
+def test_a_full_disk_is_named_and_keeps_no_part(tmp_path, keep_partial, pictures):
+    with small_disk(tmp_path / "disk", 1) as disk:
+        if disk is None:
+            pytest.skip("no right to mount a disk")
+        disk.fill()
+        with pytest.raises(DreamfleetError, match=r"drive\.mp4"):
+            film(disk.path / "drive.mp4", pictures, keep_partial=keep_partial)
+        disk.free()
+        assert list(disk.path.iterdir()) == []
+        film(disk.path / "drive.mp4", 2)
+        assert [each.name for each in disk.path.iterdir()] == ["drive.mp4"]
+
+
+@pytest.mark.parametrize(("keep_partial", "kept"), [(False, []), (True, ["drive.mp4"])])
+def test_an_error_of_the_drive_is_the_drives_own(tmp_path, keep_partial, kept):
+    with pytest.raises(FileNotFoundError, match="of the simulator"):
+        film(tmp_path / "drive.mp4", 1, keep_partial=keep_partial, error=FileNotFoundError(2, "of the simulator"))
+    assert [each.name for each in tmp_path.iterdir()] == kept

@@ -56,7 +56,7 @@ def test_any_kind_of_model_dreams_in_torch(tmp_path, kind):
     check(write_random_bundle(tmp_path / "b.zip", vae=VAEConfig(latent=3), rnn=MDNRNNConfig(**SMALL, **KINDS[kind])))
 
 
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize("name", ["all", "linear", "discrete"])
 def test_any_variant_dreams_in_torch_and_is_measured(random_bundle, name):
     bundle = random_bundle.with_controllers(None, VARIANTS[name])
     found = check(bundle, measures=("steps", "gas", "brake.share"))

@@ -1,16 +1,14 @@
 """Tests replay.py, common/runs/run_paths.py and candidate_verb.py."""
 
 import json
-import sqlite3
-from contextlib import closing
 
 import pytest
 
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.worker.addons.verification.replay import replay
 from dreamfleet.worker.scoring.failure_cause import crash
 from tests.support import rough_tasks, tasks
+from tests.support.journals import change_journal
 from tests.support.processes import call_here
 
 
@@ -43,22 +41,17 @@ def same(found):
     return [each["stored"] is not None and each["stored"] == each["replayed"] for each in found["episodes"]]
 
 
-def change(folder, statement, *values):
-    with closing(sqlite3.connect(folder / JOURNAL)) as connection, connection:
-        connection.execute(statement, values)
-
-
 @pytest.mark.slow
 def test_another_fitness_exits_1_and_one_of_another_host_class_is_counted_and_optionally_compared(processes, begin):
     finished_run = begin(tasks.TOY)
     code, found, _ = verify(processes, "0/1", "--json")
     assert (code, found["identical"], found["unchecked"], same(found)) == (0, True, 0, [True, True])
-    change(finished_run, "UPDATE result SET fitness = fitness + 1e-9 WHERE candidate = 1 AND episode = 1")
+    change_journal(finished_run, "UPDATE result SET fitness = fitness + 1e-9 WHERE candidate = 1 AND episode = 1")
     code, found, _ = verify(processes, "0/1", "--json")
     assert (code, found["identical"], found["unchecked"], same(found)) == (1, False, 0, [True, False])
     code, _, err = verify(processes, "5/0")
     assert (code, "5/0" in err) == (1, True)
-    change(finished_run, "UPDATE result SET fitness = fitness + 0.5, host_class = 'there' WHERE episode = 1")
+    change_journal(finished_run, "UPDATE result SET fitness = fitness + 0.5, host_class = 'there' WHERE episode = 1")
     code, found, err = verify(processes, "0/1", "--json")
     assert (code, found["identical"], found["unchecked"], "--tolerance" in err) == (0, False, 1, True)
     code, out, err = verify(processes, "0/1", "--tolerance", 1)
@@ -117,19 +110,19 @@ def test_a_candidate_that_failed_is_driven_again_its_cause_compared_and_one_that
     assert (code, out.count("(ArithmeticError: the world of")) == (0, 2 * failed), err
     _, found, _ = verify(processes, candidate, "--json")
     assert (found["identical"], found["fitness"], found["stored_fitness"]) == (True, None, None)
-    change(folder, "UPDATE failure SET cause = 'ValueError'")
+    change_journal(folder, "UPDATE failure SET cause = 'ValueError'")
     code, found, _ = verify(processes, candidate, "--json")
     assert (code, found["identical"]) == (1, False)
-    change(folder, "UPDATE failure SET cause = 'killed by SIGSEGV', fault = 'crash'")
+    change_journal(folder, "UPDATE failure SET cause = 'killed by SIGSEGV', fault = 'crash'")
     _, found, _ = verify(processes, candidate, "--json")
     assert [bool(each["error"]) for each in found["episodes"] if each["failure"]] == [False] * failed, "not driven"
-    change(
+    change_journal(
         folder, "INSERT INTO result (digest, kind, generation, candidate, episode, seed, fitness, steps, seconds, "
         "worker, fingerprint, incarnation, host_class) SELECT f.digest, f.kind, f.generation, f.candidate, f.episode, "
         "f.seed, -1.0, 10, 0.1, r.worker, r.fingerprint, r.incarnation, r.host_class FROM failure f, result r "
         "WHERE f.candidate = ? LIMIT 1", place.candidate,
     )  # fmt: skip
-    change(folder, "DELETE FROM failure")
+    change_journal(folder, "DELETE FROM failure")
     code, found, _ = verify(processes, candidate, "--json")
     assert code == 1
     assert any(each["stored"] == -1 and each["error"].startswith("ArithmeticError") for each in found["episodes"])
@@ -155,5 +148,5 @@ def test_a_candidate_whose_generation_got_other_seeds_is_compared_on_these_alone
         number = next(number for number in range(4) if run.fitness(0, number) is not None)
     code, found, err = verify(processes, f"0/{number}", "--json")
     assert (code, same(found)) == (0, [True] * 3), err
-    change(folder, "UPDATE generation SET seeds = '7', checksum = NULL")
+    change_journal(folder, "UPDATE generation SET seeds = '7', checksum = NULL")
     assert verify(processes, f"0/{number}")[0] == 1

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.errors import DatasetError
-from dreamfleet.worker.training.data.collect import import_rollouts
+from dreamfleet.worker.training.data.collect import collect, import_rollouts
+from dreamfleet.worker.training.data.collect_config import CollectConfig
 from dreamfleet.worker.training.data.dataset import (
     check_whole,
     episode_paths,
@@ -135,6 +136,19 @@ def test_a_drive_of_another_kind_is_never_taken_in(tmp_path, changed):
 def test_pictures_of_another_kind_are_refused(tmp_path, changes):
     with pytest.raises(DatasetError):
         load_pictures(write_drive(tmp_path, 0, **changes))
+
+
+@pytest.mark.parametrize(("there", "wanted"), [(64, 96), (96, 64)])
+def test_no_folder_gets_two_kinds_of_pictures(tmp_path, there, wanted):
+    path = write_drive(tmp_path, 7, picture=there)
+    with pytest.raises(DatasetError, match=rf"{path.name}.*{there}.*{wanted}"):
+        list(collect(tmp_path, CollectConfig(episodes=3, steps=8, picture=wanted), jobs=1))
+    other = write_drive(tmp_path / "run", 0, picture=wanted)
+    for folder, rollouts in ((tmp_path, [other]), (tmp_path / "new", [path, other])):
+        with pytest.raises(DatasetError):
+            list(import_rollouts(folder, rollouts))
+    assert not (tmp_path / "new").exists()
+    assert [each.name for each in (tmp_path / "episodes").iterdir()] == [path.name]
 
 
 @pytest.fixture

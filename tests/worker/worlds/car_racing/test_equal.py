@@ -1,5 +1,5 @@
 """The native picture is gymnasium's, to the bit. `dreamfleet lab bench env --exact` compares far more.
-Tests car.py, environment.py, native_check.py and worker/addons/bench/environment.py."""
+Tests car.py, environment.py, native_check.py, preprocessing.py and worker/addons/bench/environment.py."""
 
 import copy
 from array import array
@@ -15,7 +15,10 @@ from gymnasium.utils.env_checker import check_env
 
 import dreamfleet.worker.worlds.car_racing  # noqa: F401 - registers the environment
 from dreamfleet import DreamfleetError, find_bundle
+from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.addons.bench.environment import drive_lap, make_random_policy, random_discrete_action
+from dreamfleet.worker.tasks.pictures import box_resize
+from dreamfleet.worker.training.data.dataset import preprocessing_of_size
 from dreamfleet.worker.worlds.car_racing import car
 from dreamfleet.worker.worlds.car_racing.environment import (
     GRASS,
@@ -27,7 +30,7 @@ from dreamfleet.worker.worlds.car_racing.environment import (
     render_score,
 )  # fmt: skip
 from dreamfleet.worker.worlds.car_racing.native_check import compare, make_car_racing, native_is_exact, random_action
-from dreamfleet.worker.worlds.car_racing.preprocessing import BOX, PREPROCESSINGS
+from dreamfleet.worker.worlds.car_racing.preprocessing import BOX, PREPROCESSINGS, RAW, WHOLE, find_preprocessing
 from dreamfleet.worker.worlds.car_racing.task import make_judging_environment
 
 EXTREMES = [(9, 9, 9), (-9, -9, -9), (1e6, 1, 0), (-1, 1, 1), (0, 0, 0)]
@@ -222,3 +225,35 @@ def test_what_is_read_is_what_box2d_says():
     assert np.array_equal(np.reshape(seen, (5, 4)), true)
     with pytest.raises(AttributeError, match="this"):
         car.find_native().touch(object(), object(), True)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_picture_is_the_exact_integer_box_filter_and_the_raw_one_is_whole(seed):
+    observation = np.random.default_rng(seed).integers(0, 256, (96, 96, 3), dtype=np.uint8)
+    assert np.array_equal(BOX.picture(observation), box_resize(observation[:84], 64))
+    assert np.array_equal(RAW.picture(observation), observation)
+
+
+def test_a_preprocessing_is_found_by_name_and_by_size():
+    for each in (BOX, RAW):
+        assert find_preprocessing(each.name) is preprocessing_of_size(each.size) is each
+        assert each.picture(np.zeros((96, 96, 3), np.uint8)).shape == each.shape
+    with pytest.raises(UsageError, match=r"'bilinear-64'.*box-64, raw-96"):
+        find_preprocessing("bilinear-64")
+    with pytest.raises(UsageError, match="32"):
+        preprocessing_of_size(32)
+
+
+@pytest.mark.parametrize("levels", [256, 2])
+def test_the_whole_picture_is_pillows_to_the_bit(levels):
+    image = pytest.importorskip("PIL.Image")
+    random = np.random.default_rng(levels)
+    for _ in range(20):
+        observation = (random.integers(0, levels, (96, 96, 3)) * (255 // (levels - 1))).astype(np.uint8)
+        wanted = image.fromarray(observation).resize((64, 64), image.Resampling.BILINEAR)
+        assert np.array_equal(WHOLE.picture(observation), np.asarray(wanted))
+
+
+def test_the_environment_draws_the_whole_picture():
+    raw, whole = (CarRacing(preprocessing=each.name).reset(seed=3)[0] for each in (RAW, WHOLE))
+    assert np.array_equal(WHOLE.picture(raw), whole)

@@ -41,13 +41,6 @@ def test_left_of_a_road_is_positive():
     assert line.nearest_position(-100 + 3, 60).offset == pytest.approx(3)  # the straight back, towards the inside
 
 
-@pytest.mark.parametrize(
-    ("angle", "same"), [(0.1, 0.1), (2 * math.pi + 0.1, 0.1), (-4 * math.pi - 1, -1), (4, 4 - 2 * math.pi)]
-)
-def test_an_angle_is_wrapped(angle, same):
-    assert wrap_angle(angle) == pytest.approx(same)
-
-
 @pytest.fixture
 def environment():
     made = make_car_racing(preprocessing="box-64")

@@ -11,8 +11,8 @@ from dreamfleet import Continuous, Scorer, UsageError
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worlds.gym.spaces import make_converter, vector_actions
+from tests.support.environments import ACTIONS, STRICT
 from tests.support.specs import described_spec
-from tests.support.strict_environments import ACTIONS, STRICT
 
 
 def test_bounded_numbers_anywhere_are_one_vector():
