@@ -1,8 +1,10 @@
 """The structure that architecture.md describes: what must not grow again."""
 
+import ast
 import re
 from collections import defaultdict
 from importlib import import_module
+from importlib.metadata import entry_points
 from pathlib import Path
 
 from deploy.structure import (
@@ -50,6 +52,51 @@ WITHOUT_TEST = {
     # measurements, which people start
     *(f"worker/addons/bench/{name}.py" for name in ("batches", "live", "steps", "torch_steps")),
 }
+
+# What stands in a printed command as it is, without shlex or `shell_command`: names that were checked, and constants.
+PLAIN_WORDS = {
+    "common/addons/batches/batch_client.py": {"run"},
+    "common/cli/command_line.py": {"wanted"},
+    "common/client/client.py": {"again"},
+    "common/client/run_view.py": {"status.run"},
+    "common/host/packages.py": {"extra", "wanted"},
+    "common/runs/lookup.py": {"name"},
+    "common/verbs/control.py": {"name"},
+    "coordinator/addons/dashboard/page_state.py": {"look.status.run"},
+    "coordinator/addons/runs/stored_run.py": {"package"},
+    "coordinator/addons/runs/verb.py": {"args.kind"},
+    "coordinator/addons/spawn/agent.py": {"' '.join((*FOLDERS, CREATED, LOCK))", "' '.join(map(str, found))"},
+    "coordinator/addons/spawn/connection.py": {"address", "self._address"},  # quoted once
+    "coordinator/addons/status/status_panel.py": {
+        "status.run",
+        "task_flag",
+        "worker_flags",
+    },  # quoted where they are made
+    "coordinator/storage/journal.py": {"folder.name"},
+    "coordinator/verbs/coordinator.py": {"args.resume"},
+    "dreamfleet/experiments/demo.py": {"name"},
+    "dreamfleet/experiments/minimise.py": {"name"},
+    "worker/addons/card/card_page.py": {"CONTROLLER", "bundle"},
+    "worker/worlds/gym/environments.py": {"known[0]"},
+}
+
+
+def printed_words() -> dict[str, set[str]]:
+    """By file, the values that an f-string puts into a command as they are."""
+    verbs = {point.name.split()[0] for point in entry_points(group="dreamfleet.verbs")}
+    shell = r"\b(rm|mv|cp|cd|chmod \d+|mkdir|kill|pip install|openssl)|`ssh"
+    command = re.compile(rf"(\bdreamfleet ({'|'.join(verbs)})|{shell}) [^`;:()\n]*$")
+    quoting = re.compile(r"(shlex\.)?(quote|join)\(|shell_command\(")
+    found = defaultdict(set)
+    for path in sources(*SIDES):
+        for string in ast.walk(ast.parse((ROOT / path).read_text())):
+            before = ""
+            for part in string.values if isinstance(string, ast.JoinedStr) else ():
+                if isinstance(part, ast.Constant):
+                    before += part.value
+                elif command.search(before) and not quoting.match(word := ast.unparse(part.value)):
+                    found[str(path)].add(word)
+    return found
 
 
 def listed_modules(test: Path) -> set[str]:
@@ -110,6 +157,10 @@ def test_the_command_line_does_not_grow_again():
 
 def test_one_class_supervises_child_processes():
     assert starting_children() == STARTING_CHILDREN.keys()
+
+
+def test_each_path_in_a_printed_command_is_quoted():
+    assert printed_words() == PLAIN_WORDS, "use shell_command, resume_command or shlex: a path may hold spaces"
 
 
 def test_no_world_is_named_outside_its_room():

@@ -31,7 +31,7 @@ from dreamfleet.common.schema.display import Displayed
 from dreamfleet.common.schema.validation import OPTIONAL, MalformedError, Word, from_plain, to_plain
 
 FORMAT = 1
-TO_BUNDLE = "--out world.zip"  # of `import`, for another program's world model
+TO_BUNDLE = ("--out", "world.zip")  # of `import`, for another program's world model
 MANIFEST = "manifest.json"
 ENCODER, DECODER, POLICY, INITIAL_LATENTS_PART = "encoder.onnx", "decoder.onnx", "policy.onnx", "initial_latents.npy"
 DREAM_GRAPH = "dream.onnx"  # one step of the dream
@@ -116,7 +116,7 @@ class Bundle(Displayed):
         except FileNotFoundError:
             raise BundleError(f"no bundle at {path}") from None
         except OSError as error:
-            remedy = import_hint(path, TO_BUNDLE) if is_folder(path) else "fetch or build it again"
+            remedy = import_hint(path, *TO_BUNDLE) if is_folder(path) else "fetch or build it again"
             raise BundleError(f"{path} is not a whole bundle ({error.strerror}); {remedy}") from error
         return cls.from_bytes(path, data, sha256)
 
@@ -140,7 +140,7 @@ class Bundle(Displayed):
             if path.suffix == ".npz":
                 raise BundleError(f"{path} is not a bundle; a controller goes to --init or --controller") from error
             folder = path.parent.parent if path.suffix == ".tar" else path.parent
-            raise BundleError(f"{path} is not a bundle; {import_hint(folder, TO_BUNDLE)}") from error
+            raise BundleError(f"{path} is not a bundle; {import_hint(folder, *TO_BUNDLE)}") from error
         return cls(path, found, manifest)
 
     @property

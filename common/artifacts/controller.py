@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shlex
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -23,6 +22,7 @@ from dreamfleet.common.errors import ControllerError, MissingExtraError
 from dreamfleet.common.files.archives import ArchiveLimits, read_arrays
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.host.packages import install_command_for
+from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.printable import plural
 from dreamfleet.common.schema.display import Displayed
 from dreamfleet.common.schema.validation import OPTIONAL, to_plain
@@ -238,9 +238,10 @@ class Controller(Displayed):
         return cls(shape, parameters, about["task"], about["bundle"], dict(about["provenance"]), **details)
 
 
-def import_hint(source: Path, to: str = "--bundle WORLD_MODEL --out controller.npz") -> str:
+def import_hint(source: Path, *to: object) -> str:
     """The command that makes something of what another program wrote; by default a controller."""
-    return f"`dreamfleet import {shlex.quote(str(source))} {to}` reads what another program wrote"
+    into = to or ("--bundle", "WORLD_MODEL", "--out", "controller.npz")
+    return f"`{shell_command('import', source, *into)}` reads what another program wrote"
 
 
 def _load_predictor(controller: Controller, bundle: Bundle | None) -> Predictor:

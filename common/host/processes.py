@@ -35,8 +35,8 @@ def shell_command(*words: object) -> str:
         program = [sys.executable, "-m", "dreamfleet"]
     elif known and started.exists() and started.samefile(known):
         program = ["dreamfleet"]
-    else:
-        program = [str(started)]
+    else:  # else a program or notebook of the user, which is not ours to repeat
+        program = [str(started) if started.name == "dreamfleet" else "dreamfleet"]
     return shlex.join([*program, *map(str, words)])
 
 

@@ -56,7 +56,7 @@ def find_agent(name: str, runs_dir: Path) -> tuple[Controller | TrainedAgent, Pa
     if is_file(run / JOURNAL):
         raise _no_controller_yet(run)
     if is_folder(path):
-        raise ControllerError(f"{name} is a folder without {CONTROLLER}; {import_hint(path, '--out OUT')}")
+        raise ControllerError(f"{name} is a folder without {CONTROLLER}; {import_hint(path, '--out', 'OUT')}")
     names = ", ".join(sorted(each.stem for each in pretrained_folder().glob("*.npz"))) or "none"
     raise ControllerError(
         f"no controller {name!r}: no file, no run in {runs_dir.absolute()} (--runs-dir names another folder), and none "

@@ -14,6 +14,7 @@ import tomllib
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from shlex import join, quote
 from typing import Annotated, Any
 
 from msgspec import Meta
@@ -89,7 +90,7 @@ class Credentials:
 def issue_command(role: str, name: str) -> str:
     """The command by which a join file of this role is issued, in full; a listener is reached by names."""
     reached = ("--host", "HOST") if role in LISTENERS else ("--connect", "tls/HOST:7447")
-    return " ".join(("dreamfleet", "access", "issue", role, name, *reached, "--out", "FILE"))
+    return join(("dreamfleet", "access", "issue", role, name, *reached, "--out", "FILE"))
 
 
 def identity(role: str, seat: int) -> str:
@@ -153,7 +154,7 @@ def _check_private(path: Path, found: os.stat_result) -> None:
     """`AccessError` if others can read the file, as in ssh; the group may if the owner differs (mounted secrets)."""
     own = found.st_uid == os.geteuid()
     if found.st_mode & (stat.S_IRWXO | (stat.S_IRWXG if own else 0)):
-        raise AccessError(f"{path} is readable by others: chmod 600 {path}, or have another issued if they read it")
+        raise AccessError(f"{path} may be read by others: chmod 600 {quote(str(path))}; if it was, have another issued")
 
 
 def _parse_credentials(path: Path, document: dict[str, Any]) -> Credentials:

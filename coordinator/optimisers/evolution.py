@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from shlex import quote
 from typing import Any, cast
 
 import numpy as np
@@ -169,9 +170,8 @@ class Evolution:
         if head.name != name:
             raise JournalError(f"this state was written by optimiser {head.name!r}, not by {name!r}")
         if head.requirement != requirement:
-            raise JournalError(
-                f"this run was written with {head.requirement}: pip install {head.requirement} (now {requirement})"
-            )
+            needed = f"pip install {quote(head.requirement)}"
+            raise JournalError(f"another version wrote this run: {needed} (now {requirement})")
         try:
             if self._space is not None:
                 self._origin = self._read_origin(head)

@@ -6,6 +6,7 @@ file with it. So names are compared with what was opened, about once a second an
 
 import logging
 import os
+import shlex
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -123,11 +124,12 @@ class FileWatch:
             elif each.exists() and not foreign:
                 each.replace(free_path(each.with_name(f"{each.name}.other")))
         if foreign:
-            left = " ".join(str(each) for each in sqlite_side_files(target) if each.exists())
-            clear = f"rm {left} && " if left else ""
+            left = [str(each) for each in sqlite_side_files(target) if each.exists()]
+            clear = f"{shlex.join(('rm', *left))} && " if left else ""
+            move = shlex.join(("mv", str(copy), str(target)))
             return (
                 f"{target} was replaced while it was served: what is there now is left as it is, and what the run "
-                f"wrote is in {copy}. Continue with: {clear}mv {copy} {target} && {self._resume_command(folder)}"
+                f"wrote is in {copy}. Continue with: {clear}{move} && {self._resume_command(folder)}"
             )
         copy.replace(target)
         return (

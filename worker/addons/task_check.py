@@ -20,6 +20,7 @@ from typing import Any, cast
 
 from dreamfleet.common.addons.task_check.task_check import LAST_STEP, LEAVE_OPEN, DryRunReport
 from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.host.user_code import describe_error, keep_user_arguments
@@ -260,10 +261,10 @@ def _describe_pictures(name: str, environment: Any) -> list[str]:
     found = []
     for key, space in _observed(environment).items():
         if is_picture(space):
-            where, flag = (f" as {key!r}", f" --observation {key}") if key else ("", "")
+            where, seen = (f" as {key!r}", ("--observation", key)) if key else ("", ())
             found.append(
                 f"it observes pictures of shape {tuple(space.shape)}{where}, and the controller has a weight for each "
-                f"value: a world model makes few numbers of them (`dreamfleet pipeline --task {name}{flag}`)"
+                f"value: a world model makes few numbers of them (`{shell_command('pipeline', '--task', name, *seen)}`)"
             )
     return found
 

@@ -15,6 +15,7 @@ from safetensors.torch import save
 
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.host.stop_signals import signals_deferred
 from dreamfleet.common.schema.validation import MalformedError, from_plain, to_plain
 from dreamfleet.worker.training.data.data_folder import explain_write_errors
@@ -96,7 +97,7 @@ def _read_metadata(path: Path) -> Mapping[str, str]:
 def _open_checkpoint(path: Path) -> Iterator[Any]:
     """Open a checkpoint for NumPy; `DatasetError` if it is missing, or damaged where it is read."""
     if not path.exists():
-        raise DatasetError(f"no {path}: train it first with `dreamfleet train {path.stem}`")
+        raise DatasetError(f"no {path}: train it by `{shell_command('train', path.stem, '--data', path.parent)}`")
     try:
         with safe_open(path, "np") as file:
             yield file

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.printable import plural
 from dreamfleet.worker.training.checkpoint import load_config, load_weights
 from dreamfleet.worker.training.data import dataset
@@ -72,7 +73,7 @@ def latents_encoder_hash(folder: Path) -> str:
     vae = encoder_hash(folder)
     for path in dataset.episode_paths(folder, ENCODED):
         if str(dataset.load_arrays(path, "vae")["vae"]) != vae:
-            raise DatasetError(f"{path} belongs to another VAE: run `dreamfleet encode --data {folder}` again")
+            raise DatasetError(f"{path} belongs to another VAE; repeat `{shell_command('encode', '--data', folder)}`")
     return vae
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
 from dreamfleet.common.cli.presets import preset_help_text
+from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.host.stop_signals import stop_on_signals
 from dreamfleet.common.printable import plural
 from dreamfleet.worker.training.stages.train import MDNRNN, MODELS, VAE, TrainRequest, summarise, train_model
@@ -95,5 +96,5 @@ def _note_unencoded(data: Path) -> None:
     from dreamfleet.worker.training.encode import count_unencoded
 
     if waiting := count_unencoded(data):
-        note = f"note: not encoded or learnt from: {plural(waiting, 'drive')}; `dreamfleet encode --data {data}`"
-        print(note, file=sys.stderr)
+        encode = shell_command("encode", "--data", data)
+        print(f"note: not encoded or learnt from: {plural(waiting, 'drive')}; `{encode}`", file=sys.stderr)

@@ -13,6 +13,7 @@ from dreamfleet.common.artifacts.bundle_store import CACHE_REMEDY, default_cache
 from dreamfleet.common.errors import AccessError, CacheError, DreamfleetError
 from dreamfleet.common.files.file_system import file_system_type, is_network, lock_problem
 from dreamfleet.common.host.packages import PACKAGES, install_command, package_version, wrong_version
+from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, describe_time_left, read_join_file
 from dreamfleet.common.security.handshake import check_certificate
 
@@ -55,7 +56,7 @@ def run_checks(runs_dir: Path, join: Path | None = None, task: str | None = None
 def _check_task(task: str) -> Iterator[Finding]:
     found, name = try_task(task, {}), f"task {task}"
     if found.fault:
-        yield Finding(name, False, True, found.fault, "worker", f"dreamfleet tasks {task}")
+        yield Finding(name, False, True, found.fault, "worker", shell_command("tasks", task))
         return
     remedy = "recomputed results are not bit-identical until that is fixed"
     text = "; ".join([found.varies or "can be scored", *found.warnings])

@@ -2,6 +2,7 @@
 
 import argparse
 import logging
+import shlex
 import stat
 import sys
 from dataclasses import dataclass
@@ -47,10 +48,10 @@ class BridgeConfig(WebAddress):
         if self.token_file is None:
             return ()
         path = Path(self.token_file)
-        make = f"(umask 077; openssl rand -hex 32 > {path})"
+        make = f"(umask 077; openssl rand -hex 32 > {shlex.quote(str(path))})"
         try:
             if path.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
-                raise UsageError(f"other users may read {path}: chmod 600 {path}")
+                raise UsageError(f"other users may read {path}: chmod 600 {shlex.quote(str(path))}")
             lines = path.read_text().splitlines()
         except (OSError, UnicodeDecodeError) as error:
             raise UsageError(f"--token-file {path} cannot be read ({error}); make one: {make}") from error

@@ -65,7 +65,7 @@ class Connection:
     """A connection to a host's agent; `ConnectionFailedError` says why it failed and what to do."""
 
     def __init__(self, ssh: Sequence[str], address: str, python: str = "", forwards: Sequence[str] = ()) -> None:
-        self._address = address
+        self._address = shlex.quote(address)  # as commands show it
         program = (files("dreamfleet.coordinator.addons.spawn") / "agent.py").read_bytes()
         tunnel = [word for each in forwards for word in ("-R", f"127.0.0.1:0:{each}")]
         command = _remote_command(python, len(program))

@@ -1,6 +1,7 @@
 """A run's status as a panel for a terminal of any size: the least important lines give way; no name is truncated."""
 
 import math
+import shlex
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -315,7 +316,7 @@ def _workers_block(status: Status, width: int, worker_flags: str) -> Block:
         height = roster.height(width)
         return Block(6, min(3, height), min(8, height), height, lambda given: roster.lines(width, given))
     task = status.settings.task.task
-    task_flag = f" --task {task}" if is_unregistered(task) else ""
+    task_flag = f" --task {shlex.quote(task)}" if is_unregistered(task) else ""
     none = "no worker is present" if status.throughput.environment_steps else "no workers yet"
     messages = status.refusals or [
         f"{none}; start one with",

@@ -9,6 +9,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.cli.presets import default_run_preset
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.regular_files import is_folder, path_exists
+from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.host.stop_signals import Stop
 from dreamfleet.common.runs.records import best_evaluation
 from dreamfleet.common.runs.run_folder import open_run
@@ -54,7 +55,7 @@ class Trials:
             if not path_exists(self._data / name):
                 raise DatasetError(f"{self._data} has no {name}: collect, train the VAE and encode there first")
         if not any((self._data / "encoded").iterdir()):
-            raise DatasetError(f"{self._data} has no encoded drives: dreamfleet encode --data {self._data}")
+            raise DatasetError(f"{self._data} has no encoded drives: {shell_command('encode', '--data', self._data)}")
         path = self._folder / SETTINGS
         own = StoredContrast(str(self._data.resolve()), self._contrast)
         begun = read_document(path, partial(from_plain, StoredContrast)) or own

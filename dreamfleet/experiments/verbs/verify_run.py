@@ -45,9 +45,9 @@ def run(args: argparse.Namespace) -> int:
     config, kept = again.plan(folder)
     if again.expected_difference:
         print(f"note: {again.expected_difference}", file=sys.stderr)
-    task = shlex.join(task_flags(controller.task))
+    worker = shlex.join(("dreamfleet", "worker", "--run", folder.name, *task_flags(controller.task)))
     print(f"note: workers score run {folder.name} as they scored the first; start some on this host or others: "
-          f"dreamfleet worker --run {folder.name} {task}".rstrip(), file=sys.stderr)  # fmt: skip
+          f"{worker}", file=sys.stderr)  # fmt: skip
     request = build_request(args, folder.name, config, again.limits, kept, again.start if config else None)
     request = replace(request, again=shell_command(*args.typed))
 

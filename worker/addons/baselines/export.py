@@ -12,6 +12,7 @@ from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.artifacts.trained_agent import AgentManifest, TrainedAgent
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.host.packages import package_version
+from dreamfleet.common.host.processes import shell_command
 from dreamfleet.worker.addons.baselines.network import Networks
 from dreamfleet.worker.addons.baselines.presets import CHECKPOINT, DRQN, AgentConfig
 from dreamfleet.worker.addons.baselines.progress import parse_progress
@@ -25,7 +26,9 @@ def export_agent(folder: Path) -> TrainedAgent:
     """Return the agent of a training's last checkpoint; `UsageError` if there is none, `DatasetError` if damaged."""
     path = folder / CHECKPOINT
     if not path.exists():
-        raise UsageError(f"no agent at {path}: train one with `dreamfleet baseline train {DRQN} --data {folder}`")
+        raise UsageError(
+            f"no agent at {path}: train one with `{shell_command('baseline', 'train', DRQN, '--data', folder)}`"
+        )
     config = load_config(path, AgentConfig)
     networks = Networks(config)
     progress = parse_progress(path, load_checkpoint(path, networks, None))

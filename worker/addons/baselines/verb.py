@@ -12,6 +12,7 @@ from dreamfleet.common.cli.presets import check_preset, preset_help_text
 from dreamfleet.common.cli.progress import progress_bar
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path
+from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.host.stop_signals import stop_on_signals
 from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.printable import plural
@@ -44,7 +45,7 @@ def configure_train(parser: argparse.ArgumentParser) -> None:
 
 def train_baseline(args: argparse.Namespace) -> int:
     """Train, with a report every few episodes on stderr, and print the figures."""
-    _check_learns(args.agent, f"`dreamfleet evaluate --controller {args.agent}` judges it")
+    _check_learns(args.agent, f"`{shell_command('evaluate', '--controller', args.agent)}` judges it")
     preset = PRESETS[check_preset("baseline", args.preset)]
     config, layers = apply_settings((preset.learning, preset.agent), TABLE, args)
     draw_unseen()

@@ -12,6 +12,7 @@ from msgspec import Meta
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import read_text
+from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.printable import format_number, one_line
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
@@ -123,7 +124,7 @@ def read_evaluation_report(path: Path) -> EvaluationReport:
             raise ValueError(f"a score is beyond ±{LARGEST_FITNESS:g}")
         return found
     except FileNotFoundError:
-        raise UsageError(f"no report at {path}: `dreamfleet evaluate --out {path}` writes one") from None
+        raise UsageError(f"no report at {path}: `{shell_command('evaluate', '--out', path)}` writes one") from None
     except (OSError, ValueError, TypeError, MalformedError, RecursionError) as error:
         raise UsageError(f"{path} is not a report of `dreamfleet evaluate --out` ({error}): write it again") from error
 

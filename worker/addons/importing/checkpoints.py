@@ -11,7 +11,6 @@ from __future__ import annotations
 import codecs
 import io
 import re
-import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.archives import ArchiveLimits, DamagedArchiveError, open_archive
 from dreamfleet.common.files.regular_files import read_regular
+from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.printable import one_line
 from dreamfleet.worker.addons.importing.json_weights import Weights
 from dreamfleet.worker.addons.importing.sources import CONTROLLER, MDRNN, VAE
@@ -186,8 +186,8 @@ def array_of(tensor: torch.Tensor, path: Path) -> NDArray[np.float32]:
 def world_command(path: Path) -> str:
     """The command that imports the world model of a checkpoint's program."""
     parts = (VAE, MDRNN, CONTROLLER)
-    logdir = shlex.quote(str(path.parent.parent)) if path.absolute().parent.name in parts else "LOGDIR"
-    return f"`dreamfleet import {logdir} --out world.zip`"
+    logdir = path.parent.parent if path.absolute().parent.name in parts else "LOGDIR"
+    return f"`{shell_command('import', logdir, '--out', 'world.zip')}`"
 
 
 def _is_reward_untrained(checkpoint: _Checkpoint, shape: tuple[int, int]) -> bool:

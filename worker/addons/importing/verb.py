@@ -11,6 +11,7 @@ from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, reporting_write_errors
+from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.printable import plural
 from dreamfleet.worker.addons.importing import sources
@@ -79,10 +80,10 @@ def _import_world_model(args: argparse.Namespace) -> int:
     write = import_checkpoints if sources.holds_checkpoints(args.source) else import_json_model
     bundle = write(args.source, args.out)
     controller = sources.find_checkpoint(args.source, sources.CONTROLLER)
+    take = shell_command("import", controller or "VECTOR.json", "--bundle", args.out, "--out", "controller.npz")
     text = (
         f"{bundle.path}: a world model of {bundle.manifest.task}, controllers of {bundle.controller_shape.size} "
-        f"parameters, sha256 {bundle.sha256}; `dreamfleet import {controller or 'VECTOR.json'} --bundle {args.out} "
-        "--out controller.npz` takes a controller"
+        f"parameters, sha256 {bundle.sha256}; `{take}` takes a controller"
     )
     print_answer(args, text, bundle=bundle.path, sha256=bundle.sha256)
     return 0
@@ -94,11 +95,12 @@ def _import_drives(args: argparse.Namespace) -> int:
     found = import_drives(args.source, args.out, layout=args.layout)
     layouts = " and ".join(found.layouts)
     text = f"{args.out}: {plural(found.drives, 'drive')}, {plural(found.steps, 'step')}, read as layout {layouts}; "
-    text += f"`dreamfleet train vae --data {args.out} --preset paper` trains on them"
+    data = ("--data", args.out, "--preset", "paper")
+    text += f"`{shell_command('train', 'vae', *data)}` trains on them"
     if found.without_rewards:
         text += (
             f"; {found.without_rewards} hold no rewards: train with "
-            f"`dreamfleet train mdnrnn --data {args.out} --preset paper --set reward=none`"
+            f"`{shell_command('train', 'mdnrnn', *data, '--set', 'reward=none')}`"
         )
     print_answer(args, text, data=args.out, drives=found.drives, steps=found.steps,
            without_rewards=found.without_rewards)  # fmt: skip
@@ -110,8 +112,8 @@ def _import_controller(args: argparse.Namespace) -> int:
     controller = _read_controller(args)
     with reporting_write_errors(args.out):
         controller.save(args.out)
-    model = f" --bundle {args.bundle}" if args.bundle else ""
-    text = f"{args.out}: {controller}; `dreamfleet evaluate --controller {args.out}{model}` scores it"
+    model = ("--bundle", args.bundle) if args.bundle else ()
+    text = f"{args.out}: {controller}; `{shell_command('evaluate', '--controller', args.out, *model)}` scores it"
     print_answer(args, text, controller=args.out, sha256=controller.sha256, task=controller.task,
            parameters=len(controller.parameters))  # fmt: skip
     return 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from functools import partial
 from pathlib import Path
@@ -76,7 +77,7 @@ def video_paths(args: argparse.Namespace, default_seed: int) -> dict[int, Path]:
     videos = {seed: out if len(seeds) == 1 else out.with_stem(f"{out.stem}-{seed}") for seed in seeds}
     folder = out.parent.resolve()
     if not folder.exists() and not folder.is_relative_to(Path.cwd().resolve()):  # it may be misspelt
-        raise UsageError(f"--out {out}: make its folder first: mkdir -p {folder}")
+        raise UsageError(f"--out {out}: make its folder first: {shlex.join(('mkdir', '-p', str(folder)))}")
     for video in videos.values():
         check_output_path(video)
     return videos

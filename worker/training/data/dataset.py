@@ -14,6 +14,7 @@ from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.archives import NPY, ArchiveLimits, Arrays, DamagedArchiveError, open_archive, parse_array
 from dreamfleet.common.files.regular_files import open_regular, read_text
+from dreamfleet.common.host.processes import shell_command
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld
 from dreamfleet.worker.tasks import registry
 from dreamfleet.worker.tasks.recordable import Preprocessing, RecordableTask
@@ -109,13 +110,13 @@ def episode_paths(folder: Path, kind: str = "episodes") -> list[Path]:
     """The paths of a data set's `episodes` or `encoded` episodes, by number; `DatasetError` for fewer than two."""
     paths = sorted((folder / kind).glob("[0-9]*.npz"))
     if len(paths) < 2:
-        verb = "dreamfleet collect" if kind == "episodes" else "dreamfleet encode"
+        verb = "collect" if kind == "episodes" else "encode"
         others = (each for each in folder.glob("*/*.npz") if each.parent.name not in ("episodes", "encoded"))
         if not paths and (any(folder.glob("*.npz")) or any(others)):
-            raise DatasetError(
-                f"{folder} holds drives of another program: `dreamfleet import {folder} --out DATA` makes a data set"
-            )
-        raise DatasetError(f"{folder} holds {len(paths)} {kind}; at least 2 are needed: run `{verb} --data {folder}`")
+            make = shell_command("import", folder, "--out", "DATA")
+            raise DatasetError(f"{folder} holds drives of another program: `{make}` makes a data set")
+        more = shell_command(verb, "--data", folder)
+        raise DatasetError(f"{folder} holds {len(paths)} {kind}; at least 2 are needed: run `{more}`")
     return paths
 
 
