@@ -20,9 +20,7 @@ NAMES: dict[Kind, tuple[str, ...]] = {
     "training": tuple(sorted(("article", "attentive", "notebook", "paper", "pixels", "tiny", *_OF_TRAININGS))),
     "baseline": ("learning", "notebook"),
 }
-VERBS: dict[Kind, str] = {
-    "run": "coordinator", "training": "collect and train", "baseline": "baseline train",
-}  # fmt: skip
+VERBS: dict[Kind, str] = {"run": "coordinator", "training": "collect and train", "baseline": "baseline train"}
 
 
 def default_training_preset(task: str) -> str:

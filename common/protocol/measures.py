@@ -109,9 +109,11 @@ def describe_measure(name: str) -> str:
     if name.startswith(TRUTH):
         return f"{name} (mean over the steps, in the task's unit)"
     action, _, kind = name.partition(".")
-    means = {"": "mean over the steps, or a numbered action's share",
-             "abs": "mean magnitude over the steps, in the action's unit",
-             "share": "share of the steps in which it is above 0, from 0 to 1"}  # fmt: skip
+    means = {
+        "": "mean over the steps, or a numbered action's share",
+        "abs": "mean magnitude over the steps, in the action's unit",
+        "share": "share of the steps in which it is above 0, from 0 to 1",
+    }
     return f"{action}{'.' if kind else ''}{kind} ({means.get(kind, 'mean')})"
 
 

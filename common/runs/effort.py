@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.protocol.result_bounds import clamp_count, to_finite
@@ -36,10 +36,8 @@ class Effort:
         return cls(driven=count, microseconds=time)
 
     def __add__(self, other: Effort) -> Effort:
-        return Effort(
-            clamp_count(self.driven + other.driven), clamp_count(self.judged + other.judged),
-            clamp_count(self.dreamt + other.dreamt), clamp_count(self.microseconds + other.microseconds),
-        )  # fmt: skip
+        pairs = zip(astuple(self), astuple(other), strict=True)
+        return Effort(*(clamp_count(one + another) for one, another in pairs))
 
     @property
     def steps(self) -> int:

@@ -170,9 +170,6 @@ def _same(plain: Any) -> Any:
 @cache
 def _defaults(kind: Any) -> dict[str, Any]:
     """Each field of a dataclass with its default if it is optional, else `MISSING`; empty for another type."""
-    return {
-        each.name: MISSING if not each.metadata.get("optional")
-        else each.default if each.default_factory is MISSING
-        else each.default_factory()
-        for each in (fields(kind) if is_dataclass(kind) else ())
-    }  # fmt: skip
+    found = fields(kind) if is_dataclass(kind) else ()
+    made = {each.name: each.default if each.default_factory is MISSING else each.default_factory() for each in found}
+    return {each.name: made[each.name] if each.metadata.get("optional") else MISSING for each in found}

@@ -33,12 +33,13 @@ def recall(journal: Journal, settings: RunSettings, hosts: Collection[str]) -> s
     dropped, because their candidates follow from a wrong state of the strategy. The strategy's state is computed again
     from the fitness that the journal holds of the generations before.
     """
+    of_hosts = f"of {', '.join(sorted(hosts))} recalled"
     if settings.is_external:
-        return f"{plural(journal.recalls.recall(hosts), 'result')} of {', '.join(sorted(hosts))} recalled; what was " \
-               "handed out of complete batches stays"  # fmt: skip
+        results = plural(journal.recalls.recall(hosts), "result")
+        return f"{results} {of_hosts}; what was handed out of complete batches stays"
     closed, evaluations = journal.read_closed()
     first = _first_affected(journal.recalls.first_brought(hosts), settings)
-    words = f"{plural(journal.recalls.recall(hosts), 'result')} of {', '.join(sorted(hosts))} recalled"
+    words = f"{plural(journal.recalls.recall(hosts), 'result')} {of_hosts}"
     last = journal.last_generation()
     if last is None or first is None or first > last.number:
         return words
