@@ -9,6 +9,7 @@ from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
 from tests.support.processes import call_here
+from tests.support.same_bits import outcome
 
 GENERATIONS, BEGUN = 8, [0, 4, 6]
 STAGES = """
@@ -48,8 +49,7 @@ def test_a_run_of_three_stages_that_is_killed_in_one_scores_replays_and_shows_ea
     coordinator.wait_for_event("next stage")
     coordinator.end()
     assert processes.resume("night").finish()[0] == 0
-    with open_run(processes.runs, "night") as run:
-        steps = [[each.steps for each in run.results(one.generation, one.number)] for one in run.candidates()]
+    steps = [[steps for _, _, steps in episodes] for episodes in outcome(processes, "night").episodes]
     assert steps[0] == [3, 3], "patience cuts what never is rewarded"
     assert {each for candidate in steps[4 * 5 : 4 * 5 + 2 * 7] for each in candidate} == {7}
     assert sorted(map(len, steps[-7:])) == [2] * 3 + [4] * 4
