@@ -60,22 +60,13 @@ PLAIN_WORDS = {
     "common/client/client.py": {"again"},
     "common/client/run_view.py": {"status.run"},
     "common/host/packages.py": {"extra", "wanted"},
-    "common/runs/lookup.py": {"name"},
     "common/verbs/control.py": {"name"},
     "coordinator/addons/dashboard/page_state.py": {"look.status.run"},
     "coordinator/addons/runs/stored_run.py": {"package"},
     "coordinator/addons/runs/verb.py": {"args.kind"},
     "coordinator/addons/spawn/agent.py": {"' '.join((*FOLDERS, CREATED, LOCK))", "' '.join(map(str, found))"},
     "coordinator/addons/spawn/connection.py": {"address", "self._address"},  # quoted once
-    "coordinator/addons/status/status_panel.py": {
-        "status.run",
-        "task_flag",
-        "worker_flags",
-    },  # quoted where they are made
-    "coordinator/storage/journal.py": {"folder.name"},
-    "coordinator/verbs/coordinator.py": {"args.resume"},
-    "dreamfleet/experiments/demo.py": {"name"},
-    "dreamfleet/experiments/minimise.py": {"name"},
+    "coordinator/addons/status/status_panel.py": {"status.run", "task_flag", "worker_flags"},  # made quoted
     "worker/addons/card/card_page.py": {"CONTROLLER", "bundle"},
     "worker/worlds/gym/environments.py": {"known[0]"},
 }
@@ -160,7 +151,15 @@ def test_one_class_supervises_child_processes():
 
 
 def test_each_path_in_a_printed_command_is_quoted():
-    assert printed_words() == PLAIN_WORDS, "use shell_command, resume_command or shlex: a path may hold spaces"
+    assert printed_words() == PLAIN_WORDS, "use shell_command, run_command or shlex: a path may hold spaces"
+
+
+def test_each_command_about_a_stored_run_names_the_folder_of_runs():
+    for path in sources(*SIDES):
+        for call in ast.walk(ast.parse((ROOT / path).read_text())):
+            if isinstance(call, ast.Call) and ast.unparse(call.func) == "shell_command":
+                words = {each.value for each in call.args if isinstance(each, ast.Constant)}
+                assert not words & {"--resume", "--from", "runs", "verify", "story"} or "--runs-dir" in words, path
 
 
 def test_no_world_is_named_outside_its_room():

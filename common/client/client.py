@@ -248,7 +248,7 @@ class Client(Displayed):
     def _no_answer_error(self, run: str | None) -> ConnectionFailedError:
         whose, again, others = "any run", "--run NAME` begins one", []
         if run:
-            whose, again = f"run {run!r}", f"--resume {run}` continues one that was stopped or killed"
+            whose, again = f"run {run!r}", f"--resume {run} --runs-dir FOLDER` continues one that was stopped or killed"
             with suppress(DreamfleetError):
                 others = [each for each in self.runs(NAMES_TIMEOUT) if each != run]
         right = ", or the join file gives no right to ask" if self._credentials else ""

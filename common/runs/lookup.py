@@ -25,9 +25,10 @@ from dreamfleet.common.errors import (
     UsageError,
 )
 from dreamfleet.common.files.regular_files import is_file, is_folder, path_exists
+from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
-from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, resume_command, run_paths
+from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, resume_command, run_command, run_paths
 
 SUBSPACES = "subspaces"  # the folder of shipped subspaces: of a world model, by its name, or of a controller
 
@@ -94,10 +95,11 @@ def naming_the_stored_run(runs_dir: Path, name: str | None) -> Iterator[None]:
 def _describe_stored(runs_dir: Path, name: str | None) -> str:
     if name is None:
         count = len(list(run_paths(runs_dir)))
-        return f"for the {plural(count, 'run')} on this disk: `dreamfleet runs list`" if count else ""
+        listed = shell_command("runs", "list", "--runs-dir", runs_dir)
+        return f"for the {plural(count, 'run')} on this disk: `{listed}`" if count else ""
     with suppress(DreamfleetError), open_run(runs_dir, name) as run:
         if run.ended:
-            return f"run {name} on this disk has ended after {run.ended}: `dreamfleet runs show {name}`"
+            return f"run {name} on this disk has ended after {run.ended}: `{run_command(run.path, 'runs', 'show')}`"
         if run.state == "live":
             return f"run {name} on this disk is live: at another address, just starting, or closed to this join file"
         return f"run {name} on this disk was stopped or killed: `{resume_command(run.path)}`"

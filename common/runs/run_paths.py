@@ -34,6 +34,11 @@ def rollout_path(folder: Path, generation: int, episode: int) -> Path:
     return folder / ROLLOUTS / f"{generation:06d}-{episode:04d}.npz"
 
 
+def run_command(folder: Path, *verb: str, more: Iterable[object] = ()) -> str:
+    """The shell command of a verb about the run in `folder`: another folder may hold one of its name."""
+    return shell_command(*verb, folder.name, "--runs-dir", folder.parent, *more)
+
+
 def resume_command(folder: Path, join: object = None, access_dir: Path | None = None, trust: Iterable[str] = ()) -> str:
     """The shell command that resumes the run in `folder`.
 
@@ -42,8 +47,7 @@ def resume_command(folder: Path, join: object = None, access_dir: Path | None = 
     """
     joined = () if join is None else ("--join", join)
     access = () if join is None or access_dir is None else ("--access-dir", access_dir)
-    words = ("--resume", folder.name, "--runs-dir", folder.parent, *joined, *access)
-    return shell_command("coordinator", *words, *trust_flag(trust))
+    return run_command(folder, "coordinator", "--resume", more=(*joined, *access, *trust_flag(trust)))
 
 
 def trust_flag(modules: Iterable[str]) -> tuple[str, ...]:

@@ -39,9 +39,10 @@ class ControlVerb:
         with naming_the_stored_run(args.runs_dir, args.run_name), Client(network) as client:
             name = args.run_name or client.status().run
             command = printable(client.control(name, asked))
-        again = {"continue": command or f"dreamfleet coordinator --resume {name}"} if self.coordinator_leaves else {}
-        then = "".join(f"; continue it on its host with: {each}" for each in again.values())
-        print_answer(args, f"run {name} {self.outcome}{then}", run=name, asked=asked, accepted=True, **again)
+        again = command or f"dreamfleet coordinator --resume {name} --runs-dir FOLDER"
+        more = {"continue": again} if self.coordinator_leaves else {}
+        then = "".join(f"; continue it on its host with: {each}" for each in more.values())
+        print_answer(args, f"run {name} {self.outcome}{then}", run=name, asked=asked, accepted=True, **more)
         return 0
 
 

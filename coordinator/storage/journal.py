@@ -28,7 +28,7 @@ from dreamfleet.common.runs.journal import schema
 from dreamfleet.common.runs.journal.checksums import RECORD, REST, record_checksum, rest_checksum, state_checksum
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import ENDED_AT, RunFolder
-from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL
+from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL, run_command
 from dreamfleet.coordinator.jobs.confirmation import Finalist
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollection
@@ -128,7 +128,7 @@ class Journal(JournalConnection):
         if (folder / JOURNAL).exists():
             raise JournalError(
                 f"run {folder.name} exists: choose another --run, or continue it with --resume; "
-                f"`dreamfleet runs delete {folder.name}` removes it"
+                f"`{run_command(folder, 'runs', 'delete')}` removes it"
             )
 
     def check_incarnation(self) -> None:

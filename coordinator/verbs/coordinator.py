@@ -155,10 +155,10 @@ def serve_request(
 
 def _refuse_frozen(args: argparse.Namespace) -> None:
     if flags := [f"--{each.name.replace('_', '-')}" for each in fields(RunConfig) if each.name in args.given]:
-        raise UsageError(
-            f"{', '.join(flags)}: frozen with run {args.resume}; `dreamfleet coordinator --from {args.resume}` begins "
-            "another run from it"
-        )
+        from dreamfleet.common.runs.run_paths import run_command
+
+        again = run_command(args.runs_dir / args.resume, "coordinator", "--from")
+        raise UsageError(f"{', '.join(flags)}: frozen with run {args.resume}; `{again}` begins another run from it")
 
 
 def _warn_ignored_settings(args: argparse.Namespace, stored: RunFolder) -> None:

@@ -35,7 +35,7 @@ from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.runs.lookup import shipped_subspace_name
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL, resume_command
+from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL, resume_command, run_command
 from dreamfleet.common.runs.seeds import TEST
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
 from dreamfleet.common.worlds.profile import DemoPlan
@@ -136,7 +136,8 @@ class Demo:
         """Evolve, judge, plot, record, and print what to try next; `UsageError` if a run of that name exists."""
         for name in (each.run for each in self._demo_runs):
             if has_begun(self._runs_dir, name):
-                raise UsageError(f"run {name} exists: give another --run; `dreamfleet runs delete {name}` removes it")
+                delete = run_command(self._runs_dir / name, "runs", "delete")
+                raise UsageError(f"run {name} exists: give another --run; `{delete}` removes it")
         with ExitStack() as stack:
             self._show_page(stack)
             for demo_run in self._demo_runs:
@@ -275,7 +276,7 @@ class Demo:
         files = f": the controller, {PLOT}, {VIDEO}, the journal. Three things to try:"
         self._console.print(Text.assemble("\n", (f"In {folder}", "bold"), files))
         for command in (
-            shell_command("verify", "candidate", folder.name, "--candidate", "0/0", "--runs-dir", self._runs_dir),
+            run_command(folder, "verify", "candidate", more=("--candidate", "0/0")),
             shell_command("evaluate", "--controller", controller, "--episodes", 100),
             shell_command("coordinator", *mine, "--bundle", self._plan.bundle, "--listen", self._endpoint)
             + f"   # and beside it: {shell_command('worker', '--connect', self._endpoint)}",

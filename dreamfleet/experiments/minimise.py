@@ -18,7 +18,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.protocol.stop_kind import StopKind, StopReason
 from dreamfleet.common.runs.records import StoredGeneration, best_evaluation
-from dreamfleet.common.runs.run_paths import default_runs_dir
+from dreamfleet.common.runs.run_paths import default_runs_dir, run_command
 from dreamfleet.common.schema.display import Displayed
 from dreamfleet.experiments.local.function_names import name_function
 from dreamfleet.experiments.local.local_run import has_begun
@@ -204,7 +204,7 @@ class _Searches:
         if name is not None and has_begun(folder, name):
             raise UsageError(
                 f"run {name} exists, and a search is always a new one: give another name to run=, or none, or delete "
-                f"it by `dreamfleet runs delete {name}`"
+                f"it by `{run_command(folder / name, 'runs', 'delete')}`"
             )
         try:
             folder.mkdir(parents=True, exist_ok=True)

@@ -100,7 +100,7 @@ class BatchClient:
         if not found or (len(found) < len(sent) and not is_stored):
             raise ConnectionFailedError(
                 f"no coordinator of run {run!r} answers: it is not running, or the join file gives no right to submit; "
-                f"`dreamfleet coordinator --resume {run}` continues a run that was stopped or killed"
+                f"`dreamfleet coordinator --resume {run} --runs-dir FOLDER` continues a run that was stopped or killed"
             )
         return found
 

@@ -61,9 +61,9 @@ def _sentence(view: LiveRunView) -> str:
 
 
 def _lost_sentence(look: RunSnapshot) -> str:
-    command, rest = f"dreamfleet coordinator --resume {look.status.run}", "--runs-dir and --join where it had them"
+    command, rest = f"dreamfleet coordinator --resume {look.status.run} --runs-dir FOLDER", "--join where it had one"
     if look.folder is not None:
-        command, rest = resume_command(look.folder), "--join where it had one"
+        command = resume_command(look.folder)
     return (
         "Its coordinator was killed, or the network is cut. The page goes on once it answers again. "
         f"After a kill, continue it: {printable(command)}, with {rest}"

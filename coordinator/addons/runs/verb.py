@@ -15,6 +15,7 @@ from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.files.regular_files import is_folder, path_exists
 from dreamfleet.common.host.add_ons import find_add_on
+from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_lock import run_lock
@@ -66,7 +67,8 @@ def list_runs(args: argparse.Namespace) -> int:
         print(json.dumps([{**row, "sweep": sweeps.get(row["run"])} for row in rows], indent=2))
         return 0
     if not rows:
-        print(f"no runs in {runs_dir}; start one with: dreamfleet coordinator --run NAME", file=sys.stderr)
+        begin = shell_command("coordinator", "--run", "NAME", "--runs-dir", args.runs_dir)
+        print(f"no runs in {runs_dir}; start one with: {begin}", file=sys.stderr)
         return 0
     shown = [_shown_row(row) for row in rows]
     if any(row["run"] in sweeps for row in rows):

@@ -2,6 +2,7 @@
 common/runs/records.py."""
 
 import os
+import shlex
 import shutil
 from functools import partial
 
@@ -287,3 +288,10 @@ def test_a_reader_takes_nothing_from_a_coordinator(folder, journal):
     with RunFolder(folder) as run:
         assert run.fact("name") == "last"
     assert side_files(folder) == []
+
+
+def test_the_command_that_removes_a_run_in_the_way_names_its_folder_of_runs(folder):
+    with pytest.raises(JournalError) as refused:
+        Journal.check_absent(folder)
+    _, *words = shlex.split(str(refused.value).split("`")[1])
+    assert words == ["runs", "delete", folder.name, "--runs-dir", str(folder.parent)]
