@@ -3,6 +3,7 @@
 import pytest
 
 from dreamfleet.coordinator.addons.spawn.connection import NO_PYTHON, Connection, explain
+from tests.support.processes import DEADLINE
 
 KINDS = [
     "ssh: Could not resolve hostname x: Name or service not known",
@@ -48,3 +49,4 @@ def test_the_ports_of_tunnels_are_read_also_to_an_ipv6_address_which_ssh_names_w
         assert connection.ports(forwards) == [5, 6]
     finally:
         connection.close()
+        connection._listener.join(DEADLINE)  # else it holds the pipes until some later test
