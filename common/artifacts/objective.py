@@ -66,6 +66,8 @@ class Objective:
         `dimension` and numbers in place of lists count for all parameters; null is no bound; `log` and `integer` list
         parameters from 0 on, or are true for all.
         """
+        if not isinstance(arguments, Mapping):
+            raise UsageError(f"a function's options are names with values, not {arguments!r:.100}")
         known = (*(each.name for each in fields(cls)), "dimension")
         if unknown := sorted(set(arguments) - set(known)):
             raise UsageError(f"a function has no option {', '.join(unknown)}: it has {', '.join(known)}")

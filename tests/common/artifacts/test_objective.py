@@ -86,12 +86,16 @@ def test_equal_bounds_fix_a_parameter():
         {"x0": [1], "log": True, "lower": 0},
         *({"x0": [1], **odd} for odd in ({"integer": [1]}, {"minimise": "yes"}, {"penalty": [1, 2]}, {"step": 3})),
         {"x0": 1, "dimension": 0},
+        5,
+        [],
+        ["x0"],
+        None,
     ],
 )
 def test_what_describes_no_function_is_refused(arguments):
     with pytest.raises(UsageError):
         Objective.of(arguments)
-    for text in ("", "3", "[]", "{}", '{"environment": 3}'):
+    for text in ("", "3", "[]", "{}", '{"environment": 3}', '{"environment": []}'):
         with pytest.raises(UsageError):
             Objective.parse(text)
 

@@ -98,6 +98,7 @@ def test_failed_episodes_count_in_no_figure_and_round_trip(tmp_path):
         "", "[]", "{}", '{"drives": []}', JUDGEMENT.to_json().replace("910.0", '"910"'),
         JUDGEMENT.to_json().replace("910.0", "1e308"), JUDGEMENT.to_json().replace("910.0", "NaN"),
         JUDGEMENT.to_json().replace("10001", "10000"),  # a seed twice
+        *(replace(JUDGEMENT, options=text).to_json() for text in ("not json", "[1]", "1", "null", "[" * 100_000)),
     ],
 )  # fmt: skip
 def test_an_invalid_report_is_a_one_line_error(tmp_path, text):

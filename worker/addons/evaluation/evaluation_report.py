@@ -117,6 +117,8 @@ def read_evaluation_report(path: Path) -> EvaluationReport:
     """Read a file that `evaluate --out` wrote; `UsageError` for anything else."""
     try:
         found = from_plain_lenient(EvaluationReport, json.loads(read_text(path, MAX_BYTES)))
+        if not isinstance(json.loads(found.options or "{}"), dict):
+            raise ValueError("its options are not a JSON object")
         seeds = [*(each.seed for each in found.drives), *(each.seed for each in found.failed)]
         if len(set(seeds)) < len(seeds):
             raise ValueError("a seed occurs twice")

@@ -61,7 +61,10 @@ def _find_recorded_agent(args: argparse.Namespace, path: Path, recorded: Evaluat
     from dreamfleet.worker.addons.evaluation.agents import make_agent
 
     if is_random(recorded.name, args.runs_dir):
-        return make_random_agent(recorded.name, recorded.task, json.loads(recorded.options or "{}"))
+        try:
+            return make_random_agent(recorded.name, recorded.task, json.loads(recorded.options or "{}"))
+        except UsageError as error:
+            raise UsageError(f"{path}: {error}") from error
     controller, beside = find_agent(recorded.name, args.runs_dir)
     if controller.sha256 != recorded.controller:
         raise ControllerError(

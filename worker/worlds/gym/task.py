@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from dreamfleet.common.artifacts.actions import Actions, Discrete
 from dreamfleet.common.artifacts.task_options import check_options
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.tasks import GYM
+from dreamfleet.common.schema.validation import OPTIONAL, from_plain_lenient
 from dreamfleet.worker.tasks.api import Assignment, Description, Policy, Task, World
 from dreamfleet.worker.tasks.closing import close_environment, closing_environment
 from dreamfleet.worker.tasks.model_free_policies import FlatPolicy
@@ -32,6 +33,33 @@ from dreamfleet.worker.worlds.gym.spaces import flatten_environment, is_of_numbe
 
 OPTIONS = ("environment", "observation", "normalise", "seed")
 NORMALISING_EPISODES = 20
+
+
+@dataclass(frozen=True)
+class Normalisation:
+    """The mean and deviation of each observed number."""
+
+    mean: tuple[float, ...]
+    deviation: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class FlatOptions:
+    """The options of `GymTask.describe`, and in the place of the last two what a run freezes of them."""
+
+    environment: dict[str, Any] = field(default_factory=dict, metadata=OPTIONAL)
+    observation: tuple[str, ...] = field(default=(), metadata=OPTIONAL)
+    normal: Normalisation | None = field(default=None, metadata=OPTIONAL)
+    normalise: bool = field(default=False, metadata=OPTIONAL)
+    seed: int = field(default=0, metadata=OPTIONAL)
+
+    @classmethod
+    def parse(cls, text: str) -> FlatOptions:
+        """Of a JSON object; an empty text has the defaults. `UsageError` for a wrong one."""
+        try:
+            return from_plain_lenient(cls, json.loads(text or "{}"))
+        except (ValueError, RecursionError) as error:
+            raise UsageError(f"{text!r:.200} are not options of a gymnasium environment: {error}") from error
 
 
 class GymTask(Task):
@@ -74,8 +102,10 @@ class GymTask(Task):
 
     def make_policy(self, assignment: Assignment) -> Policy:
         """A controller on the flat observation, normalised with the statistics that the run froze."""
-        normal = assignment.spec.option("normal", {"mean": 0.0, "deviation": 1.0})
-        return FlatPolicy(assignment.controller, self.world_of(assignment).actions, normal["mean"], normal["deviation"])
+        actions, normal = self.world_of(assignment).actions, FlatOptions.parse(assignment.spec.options).normal
+        if normal is None:
+            return FlatPolicy(assignment.controller, actions)
+        return FlatPolicy(assignment.controller, actions, normal.mean, normal.deviation)
 
     def find_standalone_script(self, assignment: Assignment) -> Path | None:
         """The script for Discrete and flat Box actions; `None` for other actions, which it would have to convert.
@@ -93,16 +123,16 @@ class GymTask(Task):
         with seeds from `seed` on.
         """
         check_options(f"task {self.name}", options, OPTIONS)
-        arguments = dict(options.get("environment") or {})
-        keys = list(dict.fromkeys(options.get("observation") or ()))
+        given = FlatOptions.parse(json.dumps({key: value for key, value in options.items() if value is not None}))
+        arguments, keys = given.environment, list(dict.fromkeys(given.observation))
         with closing_environment(self._open(arguments, keys)) as environment:
             world = self._facts(arguments, keys).world
             self._check_version(environment)
             frozen: dict[str, Any] = {"environment": arguments} if arguments else {}
             if keys:
                 frozen["observation"] = keys
-            if options.get("normalise"):
-                mean, deviation = _measure_normalisation(environment, int(options.get("seed", 0)))
+            if given.normalise:
+                mean, deviation = _measure_normalisation(environment, given.seed)
                 frozen["normal"] = {"mean": mean.tolist(), "deviation": deviation.tolist()}
             observations = int(np.prod(environment.observation_space.shape or (1,)))
             steps = (environment.spec and environment.spec.max_episode_steps) or 0
@@ -166,7 +196,8 @@ _known: dict[str, _Facts] = {}  # of each environment and its arguments that thi
 
 def _frozen(assignment: Assignment) -> tuple[dict[str, Any], list[str]]:
     """The environment's arguments and the observation's keys that a run froze."""
-    return assignment.spec.option("environment", {}), assignment.spec.option("observation", [])
+    found = FlatOptions.parse(assignment.spec.options)
+    return found.environment, list(found.observation)
 
 
 class _RenderOnDemand(gymnasium.Wrapper[Any, Any, Any, Any]):

@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from dataclasses import replace
 from itertools import product
 
 import gymnasium
@@ -113,12 +114,25 @@ def test_observations_are_normalised_by_what_the_run_froze():
         (f"{FAKES}:Grey-v0", {"observation": ["screen"]}, "screen"),
         (CARTPOLE, {"wings": 2}, "wings.* environment, observation, normalise"),
         (CARTPOLE, {"environment": {"wings": 2}}, "wings"),
+        (CARTPOLE, {"environment": 5}, "environment"),
+        (CARTPOLE, {"observation": 5}, "observation"),
+        (CARTPOLE, {"normalise": True, "seed": "x"}, "seed"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*latest versioned")
 def test_what_an_environment_cannot_be_is_refused_with_the_reason(name, options, named):
     with pytest.raises(UsageError, match=named):
         describe_task(name, options)
+
+
+@pytest.mark.parametrize("options", [
+    "not json", "[1]", "[" * 100_000, '{"environment": 5}', '{"environment": [1]}', '{"observation": 5}',
+    '{"observation": [5]}', '{"normal": 5}', '{"normal": {"mean": [0.0]}}', '{"normal": {"mean": 0, "deviation": "1"}}',
+])  # fmt: skip
+def test_options_of_a_file_that_the_world_cannot_have_are_refused(options):
+    assignment = Assignment(replace(described_spec(CARTPOLE), options=options), None)
+    with pytest.raises(UsageError, match="options"):
+        find_task(CARTPOLE).world_of(assignment)
 
 
 def test_a_known_package_that_is_here_is_imported_for_its_names_alone(tmp_path, monkeypatch):
