@@ -115,7 +115,7 @@ class Reproduction:
             return f"{name}: NOT reproduced: {was} on one seed; without equal bits a comparison takes 2 seeds; {hosts}"
         if not self.is_decided:
             said = f"mean {format_number(mean)}, {self.difference.description}"
-            return f"{name}: not decided: {said}; too few seeds to tell: compare more; {hosts}"
+            return f"{name}: not decided: {said}; compare more seeds; {hosts}"
         verdict = "reproduced" if self.is_reproduced else "NOT reproduced"
         return f"{name}: {verdict}: mean {format_number(mean)}, {self.difference.description}; {hosts}"
 
