@@ -105,6 +105,8 @@ def run_facts(run: RunFolder) -> dict[str, Any]:
     if run.checks is not None:
         facts["checks"] = run.checks.description
     facts["reported"] = view_of(run).score
+    if (network := run.fact("network")) not in (None, "{}"):  # a resumed run listens where a stranger's journal says
+        facts["network"] = network
     if is_function_task(settings.task.task):
         best = best_evaluation(run.evaluations())
         facts |= _function_facts(None if best is None else run.evaluated_mean(best.generation), settings.task.options)

@@ -136,6 +136,12 @@ def test_settings_that_do_not_apply_are_left_out_and_json_has_all(runs):
     assert {"recorded", "driven", "end", "temperature"} < every["task"].keys()
 
 
+def test_where_a_resumed_run_would_listen_is_shown(runs):
+    kept = json.dumps({"listen": ["tcp/0.0.0.0:7447"], "insecure": True})
+    change_journal(runs / "reality", f"INSERT OR REPLACE INTO run (key, value) VALUES ('network', '{kept}')")
+    assert json.loads(shown()["network"])["listen"] == ["tcp/0.0.0.0:7447"]
+
+
 def test_a_limit_of_the_environment_below_the_horizon_is_said(runs):
     change_journal(runs / "reality", "INSERT INTO run (key, value) VALUES ('episode_limit', '3')")
     assert re.search(r"\b3\b", shown()["task.horizon"])
