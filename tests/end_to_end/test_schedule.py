@@ -125,15 +125,6 @@ def test_a_run_has_all_of_its_subspace_and_a_fork_goes_on_in_it_or_leaves_it(pro
 POPULATION, EPISODES = 4, 3
 
 
-@pytest.fixture
-def dreamt(random_bundle):
-    return (
-        "--preset", "dream", "--bundle", random_bundle.path, "--population", POPULATION, "--episodes", EPISODES,
-        "--horizon", 100, "--generations", 4, "--evaluate-every", 2, "--evaluation-episodes", 2, "--confirm-episodes",
-        2,
-    )  # fmt: skip
-
-
 MIXES = """
 [[stage]]
 generations = 2
@@ -153,10 +144,14 @@ DRIVEN = [0, 0, 2, 2, 2]  # of each candidate's episodes, by generation
 
 
 @pytest.mark.slow
-def test_a_run_that_dreams_then_mixes_then_drives_has_replayable_bits_through_kills(processes, dreamt):
+def test_a_run_that_dreams_then_mixes_then_drives_has_replayable_bits_through_kills(processes, random_bundle):
     path = processes.folder / "stages.toml"
     path.write_text(MIXES)
-    coordinator = processes.coordinator(*dreamt, "--schedule", path, "--generations", len(DRIVEN), name="night")
+    coordinator = processes.coordinator(
+        "--preset", "dream", "--bundle", random_bundle.path, "--population", POPULATION, "--episodes", EPISODES,
+        "--horizon", 100, "--generations", len(DRIVEN), "--evaluate-every", 2, "--evaluation-episodes", 2,
+        "--confirm-episodes", 2, "--schedule", path, name="night",
+    )  # fmt: skip
     for number in range(2):
         processes.worker("--run", "night", "--name", f"w{number}")
     for generation in (1, 2, 3):

@@ -3,6 +3,7 @@
 import dataclasses
 from contextlib import contextmanager
 from logging import getLogger
+from types import SimpleNamespace
 
 from dreamfleet.common.client.status import WorkerCount
 from dreamfleet.common.host.error_counter import ErrorCounter
@@ -44,17 +45,10 @@ def snapshot(generations=8, workers=1, population=16, name="night", **changes):
     return Snapshot(status, fleet, history.view(), looks, candidate_scores, None, None, EventLog().view(), 0.0)
 
 
-class Served:
-    """Holds the snapshot that is served; a test may replace it."""
-
-    def __init__(self, first):
-        self.snapshot = first
-
-
 @contextmanager
 def serving(endpoint, first, *others):
-    """Serve at `endpoint` the snapshot `first`, which may be replaced, and `others`."""
-    served = Served(first)
+    """Serve at `endpoint` the snapshot `first`, which a test may replace, and `others`."""
+    served = SimpleNamespace(snapshot=first)
     with open_session(Network(listen=(endpoint,))) as session:
         error_counter = ErrorCounter(getLogger(__name__))
         declare_status(session, first.status.run, lambda: served.snapshot, error_counter)
