@@ -47,6 +47,7 @@ FOLDERS = ("environments", "workers", "cache")  # under the root
 LOCK, LOCK_CONTENT = "lock", b"dreamfleet\n"
 # Starts a worker only once a line says that its state is written: one that nobody knows of could not be ended.
 ONCE_KNOWN = ("/bin/sh", "-c", 'read known && exec "$@" </dev/null', "sh")
+PR_SET_PDEATHSIG = 1  # prctl(2)
 JOIN_HERE = "{join}"  # placeholder for the join file's path
 
 
@@ -526,6 +527,7 @@ def _launch(host_folder: HostFolder, folder: Path, request: dict[str, Any]) -> s
         began = subprocess.Popen(
             [*ONCE_KNOWN, *words], stdin=subprocess.PIPE, stdout=out, stderr=out, start_new_session=True, cwd=folder,
             env={**os.environ, **host_folder.caches, **request["env"], REPORTS_VARIABLE: str(folder / REPORTS)},
+            preexec_fn=_end_with_agent if request["held"] else None,  # noqa: PLW1509 - the agent has one thread
         )  # fmt: skip
     assert began.stdin is not None
     state = {"digest": request["digest"], "slots": request["slots"], "since": time.time(), "node": platform.node(),
@@ -536,6 +538,14 @@ def _launch(host_folder: HostFolder, folder: Path, request: dict[str, Any]) -> s
         _write_private(folder / STATE, json.dumps(state).encode())
         began.stdin.write(b"\n")
     return began
+
+
+def _end_with_agent() -> None:
+    """Have Linux end this process with the agent, also with one that is killed: its tunnel is gone then."""
+    with suppress(ImportError, OSError, AttributeError):
+        import ctypes
+
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _wait_for_begin(began: subprocess.Popen[bytes], folder: Path, channel: Channel) -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from dreamfleet.coordinator.addons.spawn import agent
 from dreamfleet.coordinator.addons.spawn.agent import COMPLETE, CREATED, FOLDERS, MARK, STATE, Channel, HostFolder
-from tests.support.processes import ROOT
+from tests.support.processes import ROOT, ends
 
 
 def answer(asked, capsys):
@@ -194,6 +194,24 @@ def started(tmp_path):
     yield {"do": "start", "root": str(host_folder.root), "name": "box", "held": False, "digest": "1"}, folder, child.pid
     child.kill()
     child.wait()
+
+
+def test_a_worker_by_a_tunnel_ends_with_an_agent_that_is_killed(tmp_path):
+    program = (
+        "import os, signal; open(os.environ['DREAMFLEET_REPORTS'], 'w').write('{\"begun\": 1}'); "
+        "print('here', flush=True); signal.pause()"
+    )
+    asked = {"do": "start", "root": str(tmp_path / "place"), "name": "box", "python": sys.executable, "held": True,
+             "words": ["-c", program, "worker"], "env": {}, "digest": "1", "slots": 1}  # fmt: skip
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, agent.__file__], stdin=pipe, stdout=pipe, text=True) as killed:
+        print(json.dumps(asked), file=killed.stdin, flush=True)
+        said = (json.loads(each.removeprefix(MARK)) for each in killed.stdout if each.startswith(MARK))
+        assert next(each["ok"] for each in said if each.get("ok"))["running"]
+        state = json.loads((tmp_path / "place" / "workers" / "box" / STATE).read_text())
+        worker = os.pidfd_open(state["pid"])
+        killed.kill()
+    assert ends(worker)
 
 
 def test_a_worker_is_this_hosts_after_the_host_is_renamed(started, capsys, monkeypatch):
