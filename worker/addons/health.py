@@ -1,7 +1,5 @@
 """The worker's own checks for `dreamfleet doctor`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from dreamfleet.common.addons.doctor.health import Finding

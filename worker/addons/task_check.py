@@ -5,8 +5,6 @@ from stdin and writes lines of JSON: a step's name before each step, to which a 
 the last counts.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

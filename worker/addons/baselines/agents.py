@@ -1,7 +1,5 @@
 """Agents without a world model: random drivers, and the network in its training's folder."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Export a trained network as an agent that drives without torch."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The recurrent duelling double Q network: a Q value of each choice from pictures and memory, and its updates."""
 
-from __future__ import annotations
-
 import copy
 import math
 

@@ -1,7 +1,5 @@
 """The recurrent duelling network's layers, the hyperparameters of its training, and presets of both; without torch."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """A training's progress, as its checkpoint keeps it, and the reports over groups of episodes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Train the recurrent duelling double Q network in CarRacing, from rewards alone."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """`dreamfleet baseline train|export`: agents without a world model, by the judge of controllers."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

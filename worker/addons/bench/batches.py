@@ -1,7 +1,5 @@
 """Benchmark submitted batches: how many evaluations a second a caller reaches over Zenoh and over HTTP."""
 
-from __future__ import annotations
-
 import base64
 import http.client
 import json

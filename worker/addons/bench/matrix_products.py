@@ -3,8 +3,6 @@
 With one library alone, a step would look better wherever that library is slow on the processor or configured to be.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from importlib import import_module
 from importlib.util import find_spec

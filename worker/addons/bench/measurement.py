@@ -1,7 +1,5 @@
 """Time calls in alternating blocks."""
 
-from __future__ import annotations
-
 import socket
 import statistics
 from collections.abc import Callable, Hashable

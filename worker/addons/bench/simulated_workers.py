@@ -1,7 +1,5 @@
 """Simulated workers: the whole protocol without scoring, many in one process, to load a real coordinator."""
 
-from __future__ import annotations
-
 import queue
 import time
 from collections import deque

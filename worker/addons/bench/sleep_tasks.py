@@ -1,7 +1,5 @@
 """Tasks whose episodes take a known time, to measure the overhead around them."""
 
-from __future__ import annotations
-
 import time
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Benchmark a policy step and the dream against their matrix products alone and against torch, in turns."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A policy step and a dream step in torch, one operation at a time, as a comparison for the ONNX graphs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

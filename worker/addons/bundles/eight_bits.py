@@ -1,7 +1,5 @@
 """Turn a bundle into one whose encoder and LSTM multiply eight-bit integers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

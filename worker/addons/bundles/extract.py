@@ -1,7 +1,5 @@
 """A bundle taken apart: its models as checkpoints from which training can continue."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Turn a bundle back into checkpoints from which training can resume."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

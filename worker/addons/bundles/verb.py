@@ -1,7 +1,5 @@
 """`dreamfleet bundle`: freeze a trained world model into one file, and back."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

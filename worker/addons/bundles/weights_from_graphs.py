@@ -4,8 +4,6 @@ This is the inverse of `export`: it reads constants in the order in which that w
 weights stay rounded to half precision; exporting them again gives the same bytes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

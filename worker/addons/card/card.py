@@ -1,7 +1,5 @@
 """A folder that publishes a controller: a card, its scores, pictures and files, and a script without dreamfleet."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from functools import partial

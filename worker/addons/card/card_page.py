@@ -1,7 +1,5 @@
 """The page of a published controller: a model card in Markdown, under the metadata that model hubs read."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Encoder, MDN-RNN and one controller as one ONNX graph, made of a bundle's own graphs."""
 
-from __future__ import annotations
-
 import numpy as np
 import onnx
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """The scores of an evaluation as a picture: one point a seed, the mean with its standard error, and a histogram."""
 
-from __future__ import annotations
-
 import io
 
 from matplotlib.figure import Figure

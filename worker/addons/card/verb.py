@@ -1,7 +1,5 @@
 """`dreamfleet card`: a controller as a folder to publish."""
 
-from __future__ import annotations
-
 import argparse
 from contextlib import ExitStack
 from pathlib import Path

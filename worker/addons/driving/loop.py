@@ -1,7 +1,5 @@
 """Driving by hand: the environments, how they are drawn, and the loop that steps one with the keys of a window."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable

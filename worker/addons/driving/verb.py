@@ -1,7 +1,5 @@
 """`dreamfleet drive`: drive yourself."""
 
-from __future__ import annotations
-
 import argparse
 from secrets import randbelow
 

@@ -1,7 +1,5 @@
 """Agents, which are evaluated, recorded and watched: a controller with its world model, or a trained agent without."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable

@@ -1,7 +1,5 @@
 """Evaluating agents on unseen seeds, in the environment that their task's reported scores come from."""
 
-from __future__ import annotations
-
 import logging
 import os
 from collections.abc import Callable, Iterator, Sequence

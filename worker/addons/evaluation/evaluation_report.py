@@ -1,7 +1,5 @@
 """The report that `dreamfleet evaluate` writes: a controller's episodes, and all that is needed to repeat them."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, dataclass, field
 from functools import cached_property

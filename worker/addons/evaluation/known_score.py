@@ -1,7 +1,5 @@
 """The mean score of a controller, where it was measured: of a shipped one by `evaluate`, of others by their run."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

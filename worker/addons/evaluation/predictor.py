@@ -1,7 +1,5 @@
 """A controller without an episode loop: observation and recurrent state in, action and next state out."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from threading import Lock
 from typing import Any

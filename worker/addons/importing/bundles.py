@@ -1,7 +1,5 @@
 """World models of hardmaru/WorldModelsExperiments, carracing, and of ctallec/world-models, as bundles."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

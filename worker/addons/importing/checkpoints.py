@@ -6,8 +6,6 @@ Its LSTM takes the action before the latent, its encoder gives the log deviation
 latents, and its controller's outputs are the action. A bundle says the rest: the layers, the pictures and the heads.
 """
 
-from __future__ import annotations
-
 import codecs
 import io
 import re

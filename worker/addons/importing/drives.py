@@ -5,8 +5,6 @@ WME's `record/*.npz` hold `obs` as uint8 and `action` as float16, the article's 
 shifted: the article's `reward` is that of the action before, and ctallec's picture is the one after its action.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -4,8 +4,6 @@ A file is a list of arrays, each number 10,000 times the weight and rounded, in 
 them. The layers are the paper's, so a file of other layers is refused by the first array that does not fit.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a file or folder of another project holds, by the names in it, and what cannot be read here; nothing is read."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from dreamfleet.common.errors import DatasetError

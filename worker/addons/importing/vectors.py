@@ -1,7 +1,5 @@
 """Parameter vectors of other programs: JSON of the paper's and the article's code, NumPy, text, pycma's output."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Drives with disturbed actions, with the true state beside the world model's, and dreams from their steps on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import count

@@ -8,8 +8,6 @@ A dream may be plausible from step to step and yet contain fewer or milder bends
 for what it contains.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice

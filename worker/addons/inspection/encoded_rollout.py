@@ -1,7 +1,5 @@
 """A drive with the encoder's latents of its pictures, recorded anew in a bundle's world."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import count

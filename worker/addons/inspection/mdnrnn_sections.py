@@ -1,7 +1,5 @@
 """Sections on the MDN-RNN: a dream beside the drive, predicted rewards, and attention weights."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

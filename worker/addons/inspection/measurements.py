@@ -1,7 +1,5 @@
 """Measure a world model: choose who drives, drive in its world, and compare with its dreams."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from itertools import islice
 

@@ -1,7 +1,5 @@
 """An HTML page of sections that needs no other file, and the figures in them as PNG."""
 
-from __future__ import annotations
-
 import io
 from base64 import b64encode
 from collections.abc import Sequence

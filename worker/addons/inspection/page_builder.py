@@ -1,7 +1,5 @@
 """Build an inspection page: from a bundle, a run or trainings to a folder of pictures and an HTML page."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace

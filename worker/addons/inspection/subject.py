@@ -1,7 +1,5 @@
 """What is inspected, and who drives meanwhile: a controller, also one of another world model, or a random driver."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

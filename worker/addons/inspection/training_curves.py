@@ -1,7 +1,5 @@
 """The curves of a page: the losses of trainings, read from their data folders, and the fitness of a run."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

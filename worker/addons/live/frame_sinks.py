@@ -1,7 +1,5 @@
 """Outputs of live frames other than a window: a video, a folder of pictures, or a stream."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Callable, Iterator

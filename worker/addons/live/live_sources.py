@@ -1,7 +1,5 @@
 """The two sources of live frames: a worker that scores, and a controller that is driven for the viewer."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import count

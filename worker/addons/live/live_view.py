@@ -1,7 +1,5 @@
 """Drawing live frames of a worker: what the model sees, what it decodes, and how its dream continues from there."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any

@@ -1,7 +1,5 @@
 """Drawing one step of a drive as one frame: the world, and beside it what the model sees, decodes and dreams."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Turning the steps of a drive into frames: the world, and what the model sees, decodes and dreams."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace

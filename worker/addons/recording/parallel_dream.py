@@ -1,7 +1,5 @@
 """Dreams that start from a real drive: the same controller, continued inside the world model."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

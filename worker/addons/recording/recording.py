@@ -1,7 +1,5 @@
 """Recording a drive as a video."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

@@ -10,8 +10,6 @@ features can also include "views": the directions of [z, h] that correlate best 
 canonical correlation analysis (Hotelling 1936).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

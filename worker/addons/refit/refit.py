@@ -6,8 +6,6 @@ old first layer gives on its own model's. Later layers stay as they are. This is
 of the controller, on drives that other drivers may have driven.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

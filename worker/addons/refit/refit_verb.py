@@ -1,7 +1,5 @@
 """`dreamfleet lab refit`: a controller for another world model."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

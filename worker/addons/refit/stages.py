@@ -1,7 +1,5 @@
 """Refitting a controller to another world model, and finding a subspace for a search, by recorded drives, as stages."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

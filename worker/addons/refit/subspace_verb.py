@@ -1,7 +1,5 @@
 """`dreamfleet lab subspace`: fewer features for a search."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

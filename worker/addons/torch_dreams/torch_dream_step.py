@@ -1,7 +1,5 @@
 """A dreamed step of controllers and MDN-RNN in torch, for a graphics processor; the weights are the bundle's."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`dreamfleet verify candidate`: recompute a stored fitness bit by bit."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -1,7 +1,5 @@
 """Comparison of recorded scores with those of the same episodes repeated."""
 
-from __future__ import annotations
-
 from dataclasses import astuple, dataclass
 from functools import cached_property
 from itertools import starmap

@@ -1,7 +1,5 @@
 """Making an environment by the name and arguments of a task, and what it says of itself."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Mapping

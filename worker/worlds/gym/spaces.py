@@ -3,8 +3,6 @@
 A number of a `Discrete` or `MultiDiscrete` space is one-hot there; entries of a `Dict` stand in the order of its keys.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 from typing import Any
