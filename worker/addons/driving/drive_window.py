@@ -1,13 +1,11 @@
 """The window of a person who drives: it shows the picture and the score, and reads the keys."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import TracebackType
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 import pygame
@@ -64,7 +62,7 @@ class DriveWindow:
         self._caption = ""
         self.pedals = Pedals()
 
-    def __enter__(self) -> DriveWindow:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:

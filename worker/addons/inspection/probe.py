@@ -3,11 +3,9 @@
 They are linear or by a small network, in NumPy alone: inspection needs no torch.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +37,7 @@ class Scale:
     deviation: Floats
 
     @classmethod
-    def of(cls, values: Any, weights: Floats | None = None) -> Scale:
+    def of(cls, values: Any, weights: Floats | None = None) -> Self:
         """Compute the scale of `values` `(N, columns)` with `weights` `(N,)`."""
         mean = np.average(values, axis=0, weights=weights)
         deviation = np.sqrt(np.average((values - mean) ** 2, axis=0, weights=weights))
@@ -63,7 +61,7 @@ class LinearProbe:
     weights: Floats
 
     @classmethod
-    def fit(cls, features: Any, targets: Any, weights: Floats | None = None) -> LinearProbe:
+    def fit(cls, features: Any, targets: Any, weights: Floats | None = None) -> Self:
         """Fit `features` (N, features) to `targets` (N, quantities) with sample `weights` (N,)."""
         inputs, outputs = Scale.of(features, weights), Scale.of(targets, weights)
         x, y = inputs.apply(features), outputs.apply(targets)
@@ -87,7 +85,7 @@ class NetworkProbe:
     layers: tuple[Floats, ...]  # weights and biases of the layer, then of the output
 
     @classmethod
-    def fit(cls, features: Any, targets: Any, seed: int = 0) -> NetworkProbe:
+    def fit(cls, features: Any, targets: Any, seed: int = 0) -> Self:
         """Fit a network; the same data and seed give the same network."""
         inputs, outputs = Scale.of(features), Scale.of(targets)
         x, y = (each.astype(np.float32) for each in (inputs.apply(features), outputs.apply(targets)))
@@ -149,7 +147,7 @@ class Estimate:
     error: float | None  # `None` for the mean of one value
 
     @classmethod
-    def of(cls, values: Sequence[float]) -> Estimate:
+    def of(cls, values: Sequence[float]) -> Self:
         """The mean of values and its standard error."""
         return cls(float(np.mean(values)), standard_error([float(each) for each in values]))
 

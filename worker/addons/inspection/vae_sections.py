@@ -1,12 +1,10 @@
 """A VAE of a bundle or a data folder: its reconstructions of a drive and of own pictures, and what its latents mean."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pygame
@@ -49,13 +47,13 @@ class VAEView:
     decode: Callable[[Floats], Pictures]
 
     @classmethod
-    def of_bundle(cls, bundle: Bundle) -> VAEView:
+    def of_bundle(cls, bundle: Bundle) -> Self:
         """The VAE of a world model."""
         manifest = bundle.manifest
         return cls(manifest.picture[0], manifest.latent, Encoder(bundle).encode, Decoder(bundle).decode)
 
     @classmethod
-    def of_folder(cls, folder: Path) -> VAEView:
+    def of_folder(cls, folder: Path) -> Self:
         """The last checkpoint in a data folder; `DatasetError` if there is none or it is damaged."""
         if missing := [each for each in NEEDED if find_spec(each) is None]:
             raise MissingExtraError(f"a VAE outside a bundle needs {missing[0]!r}: pip install 'dreamfleet[train]'")

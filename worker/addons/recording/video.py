@@ -1,12 +1,10 @@
 """Writing pictures to a video file."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Self
 
 import av
 import numpy as np
@@ -29,7 +27,7 @@ class Video:
         self._container: Any = None
         self._stream: Any = None
 
-    def __enter__(self) -> Video:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: Any) -> None:
