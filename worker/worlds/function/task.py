@@ -39,6 +39,8 @@ class ObjectiveError(DreamfleetError):
 class FunctionTask(Task):
     """The task `function:MODULE:NAME`: a function of a vector, and of a seed if a parameter of it has that name.
 
+    >>> from dreamfleet.common.host.trusted_modules import trust
+    >>> trust(["math"])  # as `--task function:math:fsum` does
     >>> FunctionTask("math:fsum").describe({"environment": {"x0": [1, 2]}}).outputs
     2
     """
