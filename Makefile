@@ -155,8 +155,8 @@ keyed: $(VENV)/.dev  ## the tests with a key in place of each message: one that 
 core: $(VENV)/.dev  ## the core's tests in a copy without any add-on
 	$(PYTHON) deploy/core.py $(ARGS)
 
-structure:  ## figures of the structure: rooms, floors, imports between rooms, files a folder, class names, wording
-	$(PYTHON) deploy/structure.py $(ARGS)
+structure:  ## figures of the structure: rooms, floors, imports, wording; FILE=PATH: what a change of that file may touch
+	$(PYTHON) deploy/structure.py $(FILE) $(ARGS)
 
 words:  ## words a page, sentences of more than 30 words, words to avoid; PAGES='README.md printed': which ones
 	@$(PYTHON) deploy/words.py $(PAGES) $(ARGS)

@@ -1,6 +1,7 @@
 """Measure the structure of the code: rooms, floors, imports between rooms, folder sizes, class names, wording.
 
-`make structure` prints the figures; `tests/test_structure.py` holds those that must not grow.
+`make structure` prints the figures; `tests/test_structure.py` holds those that must not grow. With `FILE=PATH` it says
+what a change of that file may touch.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[1]
 SIDES = ("common", "coordinator", "worker", "dreamfleet/experiments")  # and the floor above both
@@ -192,16 +194,46 @@ def measure() -> dict[str, object]:
     return figures
 
 
+def about(path: Path) -> dict[str, list[str]]:
+    """What a change of a file (a path in the repository) may touch: its room, importers, tests and documents."""
+    module, room = module_of(path), path.parent / "__init__.py"
+    users = [
+        str(each)
+        for each in sources(*SIDES, "tests")
+        if any(f"{found}.".startswith(f"{module}.") for found in imports_of(each))
+    ]
+    name = str(path) if len(list(ROOT.glob(f"*/**/{path.name}"))) > 1 else path.name
+    documents = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
+    mirrored = f"tests/{path.parent}/test_{path.name}".replace("dreamfleet/", "")
+    listing = [str(each) for each in sources("tests") if re.search(rf"\b{name}\b", (ROOT / each).read_text())]
+    tests = {each for each in (mirrored, *listing, *users) if each.startswith("tests/") and (ROOT / each).exists()}
+    listed = f'"{path.stem}"' in (ROOT / room).read_text()
+    declared = re.findall(rf'.*"dreamfleet\.{re.escape(module)}[":].*', (ROOT / "pyproject.toml").read_text())
+    return {
+        str(path): [ast.get_docstring(ast.parse((ROOT / path).read_text())) or ""],
+        str(path.parent): [
+            ast.get_docstring(ast.parse((ROOT / room).read_text())) or "",
+            "the room lists it for others" if listed else "the room's own: no other room imports it",
+        ],
+        "imported by": [each for each in users if not each.startswith("tests/")],
+        "tests": sorted(tests),
+        "entry points": [each.strip() for each in declared],
+        "named in": [str(each.relative_to(ROOT)) for each in documents if name in each.read_text()],
+    }
+
+
 def main() -> None:
-    """Print the figures; with `--json` as one document."""
-    figures = measure()
+    """Print the figures, or what is known of the file that is named; with `--json` as one document."""
+    named = [each for each in sys.argv[1:] if not each.startswith("-")]
+    figures: dict[str, Any] = about(Path(named[0])) if named else measure()
     if "--json" in sys.argv[1:]:
         print(json.dumps(figures, indent=1))
         return
     for name, value in figures.items():
         print(f"{name}:")
-        for each in value.items() if isinstance(value, dict) else [("", value)]:
-            print("  " + " ".join(str(part) for part in each).strip())
+        parts = value.items() if isinstance(value, dict) else [(each,) for each in value] if named else [("", value)]
+        for each in parts:
+            print("  " + " ".join(str(part) for part in each).strip().replace("\n", "\n  "))
 
 
 if __name__ == "__main__":

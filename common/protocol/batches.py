@@ -1,5 +1,6 @@
 """Batches of parameter vectors that somebody else's search submits to a run: the query's header, its body, the replies.
 
+They serve rules R29 to R31; `coordinator/addons/bridge/openapi.py` describes the same states and bounds for HTTP.
 A body is the seeds as 64-bit integers, then the vectors as 32-bit floats, row by row, all little-endian.
 """
 

@@ -37,7 +37,7 @@ from dreamfleet.worker.training.data.collect_config import CollectConfig
 from dreamfleet.worker.training.data.data_folder import store_preset
 from dreamfleet.worker.training.data.dataset import episode_paths
 from dreamfleet.worker.training.data.pilot import Pilot
-from dreamfleet.worker.training.data.rollouts import done_labels, load_rollouts
+from dreamfleet.worker.training.data.rollout_batches import done_labels, load_rollouts
 from dreamfleet.worker.training.dream_facts import NO_DRIVES, describe_world
 from dreamfleet.worker.training.encode import ENCODED, encode
 from dreamfleet.worker.training.presets import PRESETS, TrainConfig

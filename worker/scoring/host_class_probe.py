@@ -51,7 +51,7 @@ class HostClassProbe:
         for moment in run_episode(environment, watched, EpisodeConfig(SEED, steps)):
             seen.append(moment.seen)
             self.add_value((moment.seen, moment.reward, moment.ended))
-        outputs: Callable[[Any], Any] = getattr(policy, "outputs", policy.act)  # see `PolicyWithOutputs`
+        outputs: Callable[[Any], Any] = getattr(policy, "outputs", policy.act)  # `Policy` describes it
         for shift in range(PROBE_CONTROLLERS):
             policy.begin(np.roll(parameters, shift))
             for each in seen:

@@ -1,4 +1,7 @@
-"""A policy whose steps somebody watches; the episode stays the same."""
+"""A policy whose steps somebody watches; the episode stays the same.
+
+The probe of a host's class hashes each snapshot: another field, order or dtype is another class for every host.
+"""
 
 from collections.abc import Callable
 from contextlib import suppress

@@ -1,4 +1,7 @@
-"""Optional: a task whose worlds report their true state."""
+"""Optional: a task whose worlds report their true state.
+
+A run's measures may read it (`measures.py`) and are stored with each score, so its names and bits must stay.
+"""
 
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from dreamfleet.worker.training.data.rollouts import (
+from dreamfleet.worker.training.data.rollout_batches import (
     Rollouts,
     done_labels,
     load_rollouts,

@@ -13,7 +13,7 @@ from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.host.stop_signals import Stop, never_stop
 from dreamfleet.worker.training.checkpoint import load_config
 from dreamfleet.worker.training.data.dataset import episode_paths, existing_episodes, load_steps, split_held_out
-from dreamfleet.worker.training.data.rollouts import Rollouts, done_labels, load_rollouts, model_inputs
+from dreamfleet.worker.training.data.rollout_batches import Rollouts, done_labels, load_rollouts, model_inputs
 from dreamfleet.worker.training.encode import ENCODED, encodes_mirrored, latents_encoder_hash
 from dreamfleet.worker.training.prediction_quality import end_quality, foresight
 from dreamfleet.worker.training.presets import TrainConfig

@@ -1,5 +1,5 @@
 """Factors weight the parts of a loss; reported losses are unweighted. Which steps count as ends.
-Tests worker/worldmodel/config_fields.py."""
+Tests worker/worldmodel/config_fields.py and worker/training/data/rollout_batches.py."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ import torch
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.worker.training import train_mdnrnn, train_vae
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights
-from dreamfleet.worker.training.data.rollouts import Rollouts, done_labels, load_rollouts
+from dreamfleet.worker.training.data.rollout_batches import Rollouts, done_labels, load_rollouts
 from dreamfleet.worker.training.prediction_quality import end_quality
 from dreamfleet.worker.training.presets import TrainConfig
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, binary_loss

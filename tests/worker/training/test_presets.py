@@ -15,7 +15,7 @@ from dreamfleet.worker.training import train_mdnrnn
 from dreamfleet.worker.training.checkpoint import load_config
 from dreamfleet.worker.training.data.collect_config import CollectConfig
 from dreamfleet.worker.training.data.data_folder import check_seed, load_preset, resolve_preset, store_preset
-from dreamfleet.worker.training.data.rollouts import Rollouts, load_rollouts, model_inputs, teacher_force
+from dreamfleet.worker.training.data.rollout_batches import Rollouts, load_rollouts, model_inputs, teacher_force
 from dreamfleet.worker.training.presets import PRESETS, TrainConfig
 from dreamfleet.worker.verbs import collect, train
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN

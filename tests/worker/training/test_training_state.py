@@ -20,7 +20,7 @@ from dreamfleet.common.host.stop_signals import stop_on_signals
 from dreamfleet.worker.training import checkpoint, torch_setup, train_mdnrnn, train_vae, training_state
 from dreamfleet.worker.training.assemble import QUALITY, assemble, load_quality, record_quality
 from dreamfleet.worker.training.checkpoint import load_checkpoint, load_progress, load_weights
-from dreamfleet.worker.training.data.rollouts import load_rollouts
+from dreamfleet.worker.training.data.rollout_batches import load_rollouts
 from dreamfleet.worker.training.encode import encode
 from dreamfleet.worker.training.presets import PRESETS, TrainConfig
 from dreamfleet.worker.training.stages.train import explain_interrupt
@@ -369,7 +369,7 @@ def test_a_batch_in_chunks_has_the_same_gradients(drives, monkeypatch):
     rollouts.logvar.fill_(-100)  # chance is drawn a chunk at a time
     found = []
     for steps in (10_000, 1):
-        monkeypatch.setattr("dreamfleet.worker.training.data.rollouts.CHUNK_STEPS", steps)
+        monkeypatch.setattr("dreamfleet.worker.training.data.rollout_batches.CHUNK_STEPS", steps)
         model.zero_grad()
         values = train_mdnrnn.backward(model, rollouts, torch.Generator().manual_seed(0))
         found.append((values, [each.grad.clone() for each in model.parameters() if each.requires_grad]))

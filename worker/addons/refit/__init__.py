@@ -1,3 +1,3 @@
-"""World models adjusted after their training: subspaces, refits."""
+"""Controllers fitted to another world model by recorded drives, and subspaces of parameters for a search."""
 
 __all__ = ["refit_verb", "subspace_verb", "stages"]

@@ -1,3 +1,12 @@
 """A data set of recorded drives: collected, stored, read."""
 
-__all__ = ["dataset", "data_folder", "collect_config", "collect", "pilot", "rollouts", "drive_steps", "recorded_states"]
+__all__ = [
+    "dataset",
+    "data_folder",
+    "collect_config",
+    "collect",
+    "pilot",
+    "rollout_batches",
+    "drive_steps",
+    "recorded_states",
+]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dreamfleet.worker.training.checkpoint import load_checkpoint, load_config
 from dreamfleet.worker.training.data.dataset import episode_paths, find_world, load_steps, world_of_folder
 from dreamfleet.worker.training.data.drive_steps import DriveStep, sample_steps
-from dreamfleet.worker.training.data.rollouts import load_rollouts, teacher_force
+from dreamfleet.worker.training.data.rollout_batches import load_rollouts, teacher_force
 from dreamfleet.worker.training.encode import ENCODED
 from dreamfleet.worker.training.torch_setup import on_one_thread
 from dreamfleet.worker.training.train_mdnrnn import CHECKPOINT

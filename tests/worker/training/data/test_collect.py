@@ -1,6 +1,6 @@
 """Collecting rollouts: driven here, or imported from a run; a full disk and damaged rollouts name their files.
 
-Tests collect_config.py, pilot.py, rollouts.py, worker/worlds/car_racing/drivers.py and
+Tests collect_config.py, pilot.py, worker/worlds/car_racing/drivers.py and
 worker/worlds/car_racing/random_network.py.
 """
 

@@ -33,7 +33,7 @@ from dreamfleet.worker.training.data.dataset import (
     world_of_folder,
 )
 from dreamfleet.worker.training.data.pilot import Pilot
-from dreamfleet.worker.training.data.rollouts import load_rollouts
+from dreamfleet.worker.training.data.rollout_batches import load_rollouts
 from dreamfleet.worker.verbs import collect as verb
 from tests.support.bundles import write_world_bundle
 from tests.support.drives import write_drive

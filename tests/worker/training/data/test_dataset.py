@@ -18,7 +18,7 @@ from dreamfleet.worker.training.data.dataset import (
     picture_batches,
     split_held_out,
 )
-from dreamfleet.worker.training.data.rollouts import load_rollouts
+from dreamfleet.worker.training.data.rollout_batches import load_rollouts
 from tests.support.drives import write_drive, write_drives, write_encoded
 from tests.support.mutations import Watched, archives
 
