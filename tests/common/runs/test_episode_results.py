@@ -194,6 +194,7 @@ def test_reproduction_is_to_the_bit_on_equal_hosts_and_within_two_errors_elsewhe
     ((100, 500, 900, 300), (900, 300, 100, 510), False, False),
     (tuple(range(100)), tuple(reversed(range(100))), True, True),
     ((500,) * 100, (*(500,) * 99, 499), True, True),
+    ((500, 0, 500, 0, 480, 0, 200, 9, 120, 0), (26, 31, 22, 27, 25, 30, 24, 28, 23, 25), False, False),  # invented
 ])  # fmt: skip
 def test_on_another_host_too_few_seeds_decide_nothing(was, now, decided, holds):
     found = Reproduction(scored(*was), scored(*now, **ELSEWHERE))

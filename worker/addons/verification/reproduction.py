@@ -61,13 +61,16 @@ class Reproduction:
 
     @property
     def is_decided(self) -> bool:
-        """Whether bits decide, or the seeds: they differ significantly, or would by the scores' standard deviation."""
+        """Whether bits decide, or the seeds: they differ significantly, or would by one new standard deviation.
+
+        The recorded deviation has no say: who invents scores chooses it.
+        """
         if self.same_fingerprint or not self.differing_seeds:
             return True
         if len(self.pairs) < 2:
             return False
-        found, deviations = self.difference, (self._compared.std, self.repeated.results.std)
-        return found.is_significant or found.critical_value * found.error <= max(each or 0.0 for each in deviations)
+        found, deviation = self.difference, self.repeated.results.std or 0.0
+        return found.is_significant or found.critical_value * found.error <= deviation
 
     @property
     def is_reproduced(self) -> bool:
