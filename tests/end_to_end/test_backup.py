@@ -1,5 +1,6 @@
 """A copy of a run that is being served, from which it goes on to the same bits when its own folder is lost."""
 
+import shlex
 import shutil
 import sqlite3
 from contextlib import closing
@@ -62,6 +63,14 @@ def finished(processes):
     shutil.copytree(FIXTURES / "runs" / "dream", processes.runs / "test")
     shutil.copyfile(FIXTURES / "small.zip", processes.runs / "test" / BUNDLE)
     return processes
+
+
+def test_the_command_that_continues_the_copy_holds_in_any_folder(finished, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = back_up(finished, "safe")
+    assert code == 0, err
+    words = shlex.split(out)
+    assert words[words.index("--runs-dir") + 1] == str(tmp_path / "safe")
 
 
 def test_what_cannot_be_a_copy_is_left_alone(finished, tmp_path):

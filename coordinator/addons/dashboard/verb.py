@@ -31,9 +31,10 @@ def run(args: argparse.Namespace) -> int:
 
     network = resolve_network(args)
     joined = () if args.global_config.join is None else ("--join", str(args.global_config.join))
-    views = ViewProcesses(("--connect", *network.connect, *joined), args.runs_dir, config.views)
-    feed = Feed(Watcher(network, args.run, args.runs_dir))
-    app = make_app(feed, views, args.runs_dir, config)
+    runs_dir = args.runs_dir.absolute()  # the page shows commands to people in other folders
+    views = ViewProcesses(("--connect", *network.connect, *joined), runs_dir, config.views)
+    feed = Feed(Watcher(network, args.run, runs_dir))
+    app = make_app(feed, views, runs_dir, config)
 
     async def end_streams() -> None:
         feed.close()

@@ -134,14 +134,14 @@ def configure_backup(parser: argparse.ArgumentParser) -> None:
 
 def back_up_run(args: argparse.Namespace) -> int:
     """Copy a run and read the copy; the run may be served meanwhile."""
-    target = args.to / args.run_name
+    target = args.to.absolute() / args.run_name  # the command is for later, perhaps in another folder
     with open_run(args.runs_dir, args.run_name) as source:
         back_up(source, target)
     with open_run(args.to, args.run_name) as copy:
         generations, results = len(copy.history()), copy.result_count()
         network, has_revoked = stored_network(copy), copy.fact(REVOKED) is not None
     secured = any(each.startswith(SECURED_PREFIX) for each in (*network.get("listen", ()), *network.get("connect", ())))
-    join = args.global_config.join or ("FILE" if secured else None)
+    join = named.absolute() if (named := args.global_config.join) else "FILE" if secured else None
     access_dir = Path("FOLDER") if has_revoked else None  # of the list of revoked files, which the copy needs
     text = (
         f"copied to {target}: {plural(generations, 'closed generation')}, {plural(results, 'result')}; should its own "
