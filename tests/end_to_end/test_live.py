@@ -122,7 +122,7 @@ def test_what_cannot_be_shown_is_said_in_one_line(processes, tmp_path):
         (("--controller", "gone", "--generation", 3, "--out", tmp_path / "a"), "'gone'"),
         (("--connect", "tcp/127.0.0.1:9", "--out", tmp_path / "a"), "tcp/127.0.0.1:9"),
     ):
-        code, _, err = call_here("live", "--runs-dir", processes.runs, *flags)
+        code, _, err = processes.call("live", "--runs-dir", processes.runs, *flags)  # here a test may draw unseen
         assert (code != 0, said in err.splitlines()[-1], "Traceback" in err) == (True, True, False), err
 
 
