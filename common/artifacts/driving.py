@@ -20,7 +20,9 @@ def parse_driving(task: str, facts: WorldFacts, options: str) -> Driving:
     `task` and `facts` are of the world model's manifest; CarRacing has more options than other worlds. `UsageError` for
     options that the world does not have.
 
-    >>> driving = parse_driving("car-racing", FACTS, '{"pedals": "one", "feedback": "last"}')
+    >>> from dreamfleet import find_bundle
+    >>> facts = find_bundle("tiny").manifest.world
+    >>> driving = parse_driving("car-racing", facts, '{"pedals": "one", "feedback": "last"}')
     >>> driving.controls.outputs, driving.extra_features, driving.option_texts
     (2, 4, ('pedals=one', 'feedback=last'))
     """

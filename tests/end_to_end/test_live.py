@@ -16,7 +16,7 @@ from dreamfleet.common.protocol.messages import ViewFrame
 from dreamfleet.common.runs.lookup import find_evaluated_mean
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support import tasks
-from tests.support.processes import ROOT, call_here
+from tests.support.processes import ROOT
 from tests.support.samples import MSGPACK
 
 

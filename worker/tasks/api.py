@@ -32,7 +32,13 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Assignment:
-    """What is scored: a run's specification and, for tasks that need one, its world model."""
+    """What is scored: a run's specification and, for tasks that need one, its world model.
+
+    >>> from dreamfleet import find_bundle
+    >>> assignment = Assignment.of("car-racing", find_bundle("tiny"))
+    >>> assignment.spec.task, assignment.controller.size
+    ('car-racing', 867)
+    """
 
     spec: TaskSpec
     bundle: Bundle | None = None
