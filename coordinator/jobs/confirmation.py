@@ -164,7 +164,7 @@ class Confirmation:
 
 def total_episodes(finalists: int, episodes: int) -> int:
     """Episodes of a whole confirmation of so many finalists, with rounds of about `episodes` episodes."""
-    if finalists < 2:
+    if finalists < 2 or not episodes:
         return finalists * episodes
     return finalists * max(1, episodes // finalists) + total_episodes(-(-finalists // 2), episodes)
 

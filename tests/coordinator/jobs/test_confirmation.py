@@ -99,6 +99,7 @@ def test_the_episodes_that_the_end_takes_are_predicted(make):
     assert len({job.digest for job in night.judged} - before) == predicted > 3 * JUDGED.confirm_episodes - 1
     assert night.run.background_jobs.episodes_until_end(ending=True) == 0
     assert [total_episodes(finalists, 16) for finalists in range(5)] == [0, 16, 32, 47, 48]
+    assert [total_episodes(finalists, 0) for finalists in range(5)] == [0, 0, 0, 0, 0], "nothing is confirmed"
 
 
 @settings(max_examples=60)
