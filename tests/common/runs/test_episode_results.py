@@ -110,6 +110,30 @@ def test_an_invalid_report_is_a_one_line_error(tmp_path, text):
         read_evaluation_report(tmp_path / "nowhere.json")
 
 
+@pytest.mark.parametrize(("name", "stated"), [
+    ("n", 1000), ("mean", 671.0), ("mean", None), ("mean", "670"), ("mean", 10**400), ("std", 1.0), ("error", 0.3),
+    ("median", 900.0), ("least", 700.0), ("most", 930.0), ("steps", 1), ("finished", 3), ("speed", 99.0),
+    ("braking", 0.9), ("above_900", 1.0), ("above_950", 0.9), ("above_x", 1.0), ("scores", [670.0] * 3),
+    ("scores", 670.0), ("seeds", [1, 2, 3]),
+])  # fmt: skip
+def test_a_report_whose_figures_are_not_its_drives_is_refused(tmp_path, name, stated):
+    path = tmp_path / "report.json"
+    path.write_text(json.dumps({**json.loads(JUDGEMENT.to_json()), name: stated}))
+    if stated is None:  # states nothing
+        assert read_evaluation_report(path) == JUDGEMENT
+        return
+    with pytest.raises(UsageError, match=re.escape(str(path))):
+        read_evaluation_report(path)
+
+
+def test_a_report_may_leave_out_its_marks_and_the_last_bits_of_a_mean(tmp_path):
+    plain = json.loads(JUDGEMENT.to_json())
+    del plain["marks"]
+    plain |= {"mean": np.nextafter(plain["mean"], 0.0)}
+    (tmp_path / "report.json").write_text(json.dumps(plain))
+    assert read_evaluation_report(tmp_path / "report.json") == replace(JUDGEMENT, marks=())
+
+
 def test_a_difference_is_paired_by_seed_and_significant_above_two_standard_errors():
     found = PairedDifference.between(scored(100, 500, 900).results, scored(110, 512, 908, 0).results)
     assert (found.seeds, found.mean, found.is_significant) == (3, 10.0, True)

@@ -1,8 +1,10 @@
 """The report that `dreamfleet evaluate` writes: a controller's episodes, and all that is needed to repeat them."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
+from math import isclose
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +13,7 @@ from msgspec import Meta
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import read_text
 from dreamfleet.common.host.processes import shell_command
-from dreamfleet.common.printable import format_number, one_line
+from dreamfleet.common.printable import format_number, one_line, truncate
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.runs.standard_error import format_with_error, score_digits
@@ -21,6 +23,7 @@ GYMNASIUM = "gymnasium"  # the judge of worlds that gymnasium itself has
 MAX_MARKS = 8
 MIN_EPISODES_TO_SOLVE = 100  # customary number of episodes for gymnasium's threshold of solving an environment
 MAX_BYTES, MAX_EPISODES, MAX_SEED = 64 << 20, 10**5, 2**63
+ABOVE = "above_"  # and a mark: the share of scores above it
 Drives = Annotated[tuple[EpisodeResult, ...], Meta(min_length=1, max_length=MAX_EPISODES)]
 
 
@@ -54,15 +57,19 @@ class EvaluationReport:
 
     def to_json(self) -> str:
         """One line of JSON: the statistics, then all fields; a statistic that is unknown is null."""
+        return json.dumps({**self.figures, **asdict(self)}, allow_nan=False)
+
+    @property
+    def figures(self) -> dict[str, object]:
+        """The statistics by their names in JSON."""
         results = self.results
-        figures = {
+        return {
             "n": len(results.drives), "mean": results.mean, "std": results.std, "error": results.error,
             "median": results.median, "least": results.worst, "most": results.best, "steps": results.steps,
             "finished": results.finished, "speed": results.speed, "braking": results.braking,
-            **{f"above_{mark:g}": results.above(mark) for mark in self.marks},
+            **{f"{ABOVE}{mark:g}": results.above(mark) for mark in self.marks},
             "scores": results.scores, "seeds": results.seeds,
         }  # fmt: skip
-        return json.dumps({**figures, **asdict(self)}, allow_nan=False)
 
     def describe(self, word: str = "seed") -> str:
         """A text for display: the score, figures on driving, the threshold and the controller; `word`: one seed."""
@@ -112,9 +119,10 @@ class EvaluationReport:
 
 
 def read_evaluation_report(path: Path) -> EvaluationReport:
-    """Read a file that `evaluate --out` wrote; `UsageError` for anything else."""
+    """Read a file that `evaluate --out` wrote; `UsageError` for anything else, also for statistics of other drives."""
     try:
-        found = from_plain_lenient(EvaluationReport, json.loads(read_text(path, MAX_BYTES)))
+        plain = json.loads(read_text(path, MAX_BYTES))
+        found = from_plain_lenient(EvaluationReport, plain)
         if not isinstance(json.loads(found.options or "{}"), dict):
             raise ValueError("its options are not a JSON object")
         seeds = [*(each.seed for each in found.drives), *(each.seed for each in found.failed)]
@@ -122,11 +130,29 @@ def read_evaluation_report(path: Path) -> EvaluationReport:
             raise ValueError("a seed occurs twice")
         if not all(abs(each.score) <= LARGEST_FITNESS for each in found.drives):  # false for NaN too
             raise ValueError(f"a score is beyond ±{LARGEST_FITNESS:g}")
+        _check_figures(found, plain)
         return found
     except FileNotFoundError:
         raise UsageError(f"no report at {path}: `{shell_command('evaluate', '--out', path)}` writes one") from None
-    except (OSError, ValueError, TypeError, MalformedError, RecursionError) as error:
+    except (OSError, ValueError, TypeError, MalformedError, RecursionError, OverflowError) as error:
         raise UsageError(f"{path} is not a report of `dreamfleet evaluate --out` ({error}): write it again") from error
+
+
+def _check_figures(report: EvaluationReport, plain: Mapping[str, object]) -> None:
+    """`ValueError` for a statistic that the drives contradict; a report need not state each."""
+    marks = {name: float(name.removeprefix(ABOVE)) for name in plain if name.startswith(ABOVE)}
+    figures = {name: report.results.above(mark) for name, mark in marks.items()} | report.figures
+    for name, value in figures.items():
+        stated = plain.get(name)
+        if stated is not None and not _is_equal(stated, value):
+            raise ValueError(f"{name} is {truncate(str(stated), 40)}, and of its drives it is {value}")
+
+
+def _is_equal(stated: object, value: object) -> bool:
+    """Whether a figure is that one, up to the last bits of a mean; of scores and seeds, every bit."""
+    if isinstance(value, tuple):
+        return stated == list(value)
+    return isinstance(stated, int | float) and isinstance(value, int | float) and isclose(stated, value)
 
 
 def check_seed_range(first_seed: int, episodes: int) -> None:
