@@ -7,7 +7,9 @@ import logging
 import os
 import re
 import stat
+import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from importlib.machinery import all_suffixes
 from importlib.util import cache_from_source
 from pathlib import Path
@@ -19,6 +21,7 @@ from dreamfleet.common.runs.own_runs import own_runs_dir
 
 log = logging.getLogger(__name__)
 MOST_BYTES = 1 << 20  # of a file of `own_runs_dir`
+MOST_LINKS = 40  # that Linux follows on a path
 _UID = re.compile("[0-9a-f]{32}")  # a controller's file holds one, and it names a file here
 _CODE = tuple(all_suffixes())  # of a file that Python imports
 
@@ -51,44 +54,56 @@ def trust_own_run(uid: object, task: str, options: str) -> None:
 
 
 def _code(module: str) -> Iterator[Path]:
-    """What an import of the module may run: the code beside it, and in its whole package, with what is compiled of it.
+    """What an import of the module may run: the code beside it, and in all folders there, with what is compiled of it.
 
-    Nothing is imported yet that says which of these it names.
+    Nothing is imported yet that says which of these it names; no import names a folder with a dot in its name.
     """
     places, seen = module_places(module), set[Path]()
     folders = [*(each.parent for each in places), *(each for each in places if each.is_dir())]
-    beside = len(places)
-    for number, folder in enumerate(folders):  # which grows
+    for folder in folders:  # which grows
         yield folder
-        if not folder.is_dir():  # but an archive
+        if not folder.is_dir() or (real := folder.resolve()) in seen:  # an archive, or a link to what was seen
             continue
-        if in_package := number >= beside:
-            if (real := folder.resolve()) in seen:
-                continue
-            seen.add(real)
-        with os.scandir(folder) as entries:
+        seen.add(real)
+        with suppress(PermissionError), os.scandir(folder) as entries:
             for each in entries:
                 if each.name.endswith(_CODE):
-                    yield from (Path(each), Path(cache_from_source(each)))
-                elif in_package and each.is_dir():
+                    yield Path(each)
+                    if sys.pycache_prefix:  # else what is compiled of it lies in a folder here
+                        yield Path(cache_from_source(each))
+                elif "." not in each.name and os.path.isdir(each):  # noqa: PTH112 - also of a link nobody may follow
                     folders.append(Path(each))
 
 
 def _opening(path: Path) -> Path | None:
-    """Where others may change what the path names: there, or in a folder above it; `None` if nowhere.
+    """Where others may change what the path names: there, in a folder above it, or at a link; `None` if nowhere.
 
-    A folder above may be sticky, as /tmp is: nobody moves what others own there. What is missing, others cannot make.
+    A folder above may be sticky, as /tmp is: nobody moves what others own there, but all may make what is missing.
     """
-    for place in dict.fromkeys((path.absolute(), path.resolve())):  # a link, and what it names
-        for each in (place, *place.parents):
-            if each.exists() and not _is_mine(each, sticky=each != place):
+    for way in _ways(path.absolute()):
+        found = [each for each in (way, *way.parents) if os.path.lexists(each)]
+        for each in found:
+            if not _is_mine(each, sticky=each != found[0]):
                 return each
     return None
 
 
+def _ways(path: Path) -> Iterator[Path]:
+    """The path, and what it becomes with each link on it followed, one after the other."""
+    for _ in range(MOST_LINKS):
+        yield path
+        link = next((each for each in (*reversed(path.parents), path) if each.is_symlink()), None)
+        if link is None:
+            return
+        path = link.parent / link.readlink() / path.relative_to(link)
+
+
 def _is_mine(path: Path, *, sticky: bool) -> bool:
-    """Whether only this user, its own group and root may write there, or replace what they own if it is `sticky`."""
-    found = path.stat()
-    by_group = bool(found.st_mode & stat.S_IWGRP) and found.st_gid != os.getegid()
+    """Whether only this user and root may write there, or replace what they own if it is `sticky`.
+
+    A group is the user's alone if it has the user's number: others may share the primary one. Nobody writes to a link.
+    """
+    found = path.lstat()
+    by_group = bool(found.st_mode & stat.S_IWGRP) and found.st_gid != os.geteuid()
     shared = (by_group or found.st_mode & stat.S_IWOTH) and not (sticky and found.st_mode & stat.S_ISVTX)
-    return found.st_uid in (os.geteuid(), 0) and not shared
+    return found.st_uid in (os.geteuid(), 0) and (stat.S_ISLNK(found.st_mode) or not shared)

@@ -157,15 +157,85 @@ def test_a_module_in_an_archive_needs_the_archive(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["my_world.py", "beside.py"])
-@pytest.mark.parametrize("harm", [lambda file: file.chmod(0o666), lambda file: os.chown(file, 65534, 65534)])
+@pytest.mark.parametrize("harm", [lambda file: file.chmod(0o666), lambda file: give_away(file, 65534, 65534)])
 def test_a_module_without_a_package_needs_its_file_and_those_beside_it(world, name, harm):
     (world / name).write_text("")
-    try:
-        harm(world / name)
-    except PermissionError:
-        pytest.skip("only root gives a file away")
+    harm(world / name)
     trust_own_run(UID, TASK, OPTIONS)
     assert not is_trusted("my_world")
+
+
+@pytest.mark.parametrize("place", ["helpers", "helpers/__init__.py", "helpers/deep", "helpers/deep/more.py"])
+@pytest.mark.parametrize(("mode", "trusted"), [(0o022, True), (0o002, False)])
+def test_a_package_beside_a_module_must_be_the_users_too(world, place, mode, trusted):
+    (world / "helpers" / "deep").mkdir(parents=True)
+    for each in ("__init__.py", "deep/more.py"):
+        (world / "helpers" / each).touch()
+    (world / place).chmod((world / place).stat().st_mode & ~mode | (0 if trusted else mode))
+    trust_own_run(UID, TASK, OPTIONS)
+    assert is_trusted("my_world") is trusted
+
+
+def test_folders_that_no_import_can_name_are_not_looked_at(world):
+    for name in (".git", "python3.11"):
+        (world / name).mkdir()
+        (world / name).chmod(0o777)
+        (world / name / "code.py").touch()
+    trust_own_run(UID, TASK, OPTIONS)
+    assert is_trusted("my_world")
+
+
+@pytest.mark.parametrize(("mode", "trusted"), [(0o777, False), (0o755, True)])
+@pytest.mark.parametrize("step", ["link.py", "inner/link.py"])
+def test_each_link_of_a_chain_must_lie_where_only_the_user_writes(world, tmp_path, mode, trusted, step):
+    (tmp_path / "between" / "inner").mkdir(parents=True)
+    (tmp_path / "safe.py").touch()
+    (tmp_path / "between" / step).symlink_to(tmp_path / "safe.py")
+    (tmp_path / "last").symlink_to("between")
+    (world / "beside.py").symlink_to(Path("..", "last", "inner", "..", step))
+    (tmp_path / "between").chmod(mode)
+    trust_own_run(UID, TASK, OPTIONS)
+    assert is_trusted("my_world") is trusted
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_in_a_sticky_folder_a_link_must_be_the_users_and_name_what_exists(world, tmp_path, there):
+    (shared := tmp_path / "shared").mkdir()
+    shared.chmod(0o1777)
+    if there:
+        (shared / "more.py").touch()
+    (world / "beside.py").symlink_to(shared / "more.py")
+    trust_own_run(UID, TASK, OPTIONS)
+    assert is_trusted("my_world") is there
+
+
+def test_a_link_of_another_user_in_a_sticky_folder_is_not_followed(world, tmp_path):
+    (shared := tmp_path / "shared").mkdir()
+    shared.chmod(0o1777)
+    (tmp_path / "safe.py").touch()
+    (shared / "link.py").symlink_to(tmp_path / "safe.py")
+    (world / "beside.py").symlink_to(shared / "link.py")
+    give_away(shared / "link.py", 65534, -1)
+    trust_own_run(UID, TASK, OPTIONS)
+    assert not is_trusted("my_world")
+
+
+@pytest.mark.parametrize("private", [True, False])
+def test_a_group_may_write_only_if_it_is_the_users_private_one(world, monkeypatch, private):
+    group = os.geteuid() if private else os.geteuid() + 1
+    monkeypatch.setattr(os, "getegid", lambda: group)
+    (world / "my_world.py").chmod(0o664)
+    if (world / "my_world.py").stat().st_gid != group:
+        give_away(world / "my_world.py", -1, group)
+    trust_own_run(UID, TASK, OPTIONS)
+    assert is_trusted("my_world") is private
+
+
+def give_away(path, owner, group):
+    try:
+        os.chown(path, owner, group, follow_symlinks=False)
+    except PermissionError:
+        pytest.skip("only root gives a file away")
 
 
 def test_what_is_not_trusted_or_cannot_be_written_is_not_remembered(tmp_path, monkeypatch, caplog, ledger):
