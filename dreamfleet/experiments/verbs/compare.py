@@ -42,6 +42,8 @@ SUMMARY = (
     "`evaluate --out` (paired differences), or the settings of sweeps"
 )
 EXTRAS = ()
+#: fields of reports that may cause a difference besides the controllers, and their plurals
+OTHER_CAUSES = {"world": "worlds", "judge": "judges", "options": "options", "fingerprint": "fingerprints"}
 SAME_SEEDS = "all runs have the same validation seeds, so their ± are not independent: differences are paired"
 
 
@@ -103,10 +105,15 @@ def _compare_reports(args: argparse.Namespace, paths: Sequence[Path]) -> int:
     (first, base), *others = [(path, read_evaluation_report(path)) for path in paths]
     lines, rows = [_line(first, base)], []
     for path, each in others:
-        _warn(first, base, path, each)
+        differing = [what for what in OTHER_CAUSES if getattr(base, what) != getattr(each, what)]
+        for what in differing:
+            one, other = getattr(base, what), getattr(each, what)
+            note = f"note: {first} and {path} are of different {OTHER_CAUSES[what]}: {one!r} and {other!r}"
+            print(note, file=sys.stderr)
         found = PairedDifference.between(base.results, each.results)
         lines += [_line(path, each), f"{path} less {first}: {found.description}"]
-        rows.append({"report": path, "against": first, **asdict(found), "clear": found.is_significant})
+        figures = {**asdict(found), "clear": found.is_significant}
+        rows.append({"report": path, "against": first, **figures, "differing_facts": differing})
     print_answer(args, "\n".join(lines), differences=rows)
     return 0
 
@@ -115,14 +122,6 @@ def _line(path: Path, found: EvaluationReport) -> str:
     score = format_with_error(found.results.mean, found.results.error)
     failed = f", and {len(found.failed)} failed" if found.failed else ""
     return f"{path}: {found.name}, {score} on {plural(len(found.drives), score_word(found.world))}{failed}"
-
-
-def _warn(first: Path, base: EvaluationReport, path: Path, other: EvaluationReport) -> None:
-    """Note what besides the controllers may cause a difference."""
-    for what in ("world", "fingerprint"):
-        one, another = getattr(base, what), getattr(other, what)
-        if one != another:
-            print(f"note: {first} and {path} are of different {what}s: {one!r} and {another!r}", file=sys.stderr)
 
 
 def _compare_runs(args: argparse.Namespace, names: Sequence[str]) -> int:

@@ -5,6 +5,7 @@ import json
 import re
 from dataclasses import replace
 from math import sqrt
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -163,14 +164,24 @@ def test_the_verb_compares_each_report_with_the_first(tmp_path, capsys):
     assert command_line.main(["compare", str(paths[0])]) == UsageError.exit_code
 
 
-def test_other_differences_than_the_controllers_are_noted(tmp_path, capsys):
-    for name, changes in {"a": {}, "b": {"task": "car-racing"}, "c": {"fingerprint": "arm"}}.items():
-        (tmp_path / f"{name}.json").write_text(scored(1, 2, **changes).to_json())
-    assert command_line.main(["compare", *(str(tmp_path / f"{name}.json") for name in "abc")]) == 0
+@pytest.mark.parametrize(("changes", "differing"), [
+    ({"task": "car-racing"}, []),  # a dream's controllers are driven in reality too
+    ({"fingerprint": "arm"}, ["fingerprint"]), ({"world": "takecover"}, ["world"]), ({"judge": "dodge"}, ["judge"]),
+    ({"options": '{"environment": {"g": 1.0}}'}, ["options"]),
+])  # fmt: skip
+def test_other_differences_than_the_controllers_are_noted(tmp_path, capsys, changes, differing):
+    paths = [str(tmp_path / f"{name}.json") for name in "abc"]
+    for path, each in zip(paths, [{}, {}, changes], strict=True):
+        Path(path).write_text(scored(1, 2, **each).to_json())
+    assert command_line.main(["compare", *paths]) == 0
     what, *notes = capsys.readouterr().err.splitlines()
     assert "`evaluate`" in what
-    assert len(notes) == 1, "a dream's controllers are driven in reality too"
-    assert "'arm'" in notes[0]
+    assert [paths[2] in each and repr(changes[name]) in each for name, each in zip(differing, notes, strict=True)] == (
+        [True] * len(differing)
+    )
+    assert command_line.main(["compare", *paths, "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["differences"]
+    assert [each["differing_facts"] for each in rows] == [[], differing]
 
 
 ELSEWHERE, FAILS_NOW = {"fingerprint": "aarch64"}, (FailedEpisode(10_002, "E: x"),)
