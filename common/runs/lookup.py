@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 from dreamfleet.common.artifacts.bundle import Bundle
@@ -27,8 +28,10 @@ from dreamfleet.common.errors import (
 from dreamfleet.common.files.regular_files import is_file, is_folder, path_exists
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.printable import plural
+from dreamfleet.common.runs.records import best_evaluation
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, resume_command, run_command, run_paths
+from dreamfleet.common.runs.run_provenance import RECEIPT, judged_facts
 
 SUBSPACES = "subspaces"  # the folder of shipped subspaces: of a world model, by its name, or of a controller
 
@@ -50,6 +53,9 @@ def find_agent(name: str, runs_dir: Path) -> tuple[Controller | TrainedAgent, Pa
     if is_file(path):
         return TrainedAgent.load(path) if is_agent(path) else Controller.load(path), path.parent / BUNDLE
     for folder in (run, path):  # a run's name, or its folder
+        if is_file(folder / CONTROLLER) and is_file(folder / JOURNAL):
+            with RunFolder(folder) as stored:
+                return load_controller_of(stored), folder / BUNDLE
         if is_file(folder / CONTROLLER):
             return Controller.load(folder / CONTROLLER), folder / BUNDLE
     if is_file(shipped):
@@ -66,10 +72,26 @@ def find_agent(name: str, runs_dir: Path) -> tuple[Controller | TrainedAgent, Pa
 
 
 def load_controller_of(run: RunFolder) -> Controller:
-    """The controller that a run reports; `ControllerError` before it has one."""
+    """The controller that a run reports; `ControllerError` before it has one, or if the file is another run's.
+
+    Its file may lag behind the journal, as after a kill: the journal says which mean is reported, with which score.
+    """
     if not path_exists(run.controller_path):
         raise _no_controller_yet(run.path)
-    return Controller.load(run.controller_path)
+    found = Controller.load(run.controller_path)
+    if found.provenance.get("run_uid", run.uid) != run.uid:
+        raise ControllerError(
+            f"{run.controller_path} is not the controller of run {run.name}: it is written again when the run is "
+            f"resumed: {resume_command(run.path)}"
+        )
+    with run.read_transaction():
+        judged = run.confirmation() or best_evaluation(run.evaluations())
+        if judged is None:
+            return found
+        provenance = found.provenance | {"generation": judged.generation, **judged_facts(judged)}
+        if isinstance(receipt := provenance.get(RECEIPT), dict):
+            provenance[RECEIPT] = receipt | {"generations": len(run.history())}
+        return replace(found, parameters=run.evaluated_mean(judged.generation), provenance=provenance)
 
 
 def _no_controller_yet(run: Path) -> ControllerError:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import hashlib
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from dreamfleet.common.protocol.check_counts import CheckCounts
 from dreamfleet.common.protocol.host_classes import HostClasses
 from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.effort import Effort
-from dreamfleet.common.runs.records import RunSettings
+from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation
 from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, VALIDATION
 from dreamfleet.common.schema.validation import OPTIONAL, Count, MalformedError, from_plain_lenient
 
@@ -98,6 +99,16 @@ def read_run_settings(controller: Controller) -> RunSettings:
         return from_plain_lenient(RunSettings, controller.provenance["settings"])
     except (KeyError, ValueError, TypeError, MalformedError) as error:
         raise ControllerError(f"the controller does not contain its run's settings ({error})") from error
+
+
+def judged_facts(judged: StoredEvaluation | StoredConfirmation | None) -> dict[str, Any]:
+    """What a controller's provenance says of its score; `None`: it has none."""
+    return {
+        "validation_mean": judged and judged.mean,
+        "validation_error": judged and judged.error,
+        "validation_episodes": judged and judged.episodes,
+        "confirmed": isinstance(judged, StoredConfirmation),
+    }
 
 
 def validation_seed_ranges(settings: RunSettings) -> dict[str, tuple[int, ...]]:

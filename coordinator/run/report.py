@@ -14,7 +14,7 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import write_error
 from dreamfleet.common.files.atomic_write import fsync_path
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation
-from dreamfleet.common.runs.run_provenance import RECEIPT, RunProvenance
+from dreamfleet.common.runs.run_provenance import RECEIPT, RunProvenance, judged_facts
 from dreamfleet.common.schema.validation import to_plain
 
 SAVE_INTERVAL = 5.0  # seconds between two saves of means without evaluation: each waits for the disk
@@ -36,14 +36,10 @@ class ReportedMean:
 
     def controller(self) -> Controller:
         """The controller to save."""
-        judged = self.judged
         provenance = {
             "run_uid": self.run_uid,
             "generation": self.generation,
-            "validation_mean": judged and judged.mean,
-            "validation_error": judged and judged.error,
-            "validation_episodes": judged and judged.episodes,
-            "confirmed": isinstance(judged, StoredConfirmation),
+            **judged_facts(self.judged),
             "settings": asdict(self.settings),
             "steps": self.steps,
         }

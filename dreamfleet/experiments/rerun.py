@@ -12,9 +12,10 @@ from dreamfleet.common.cli.config import Table
 from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.protocol.host_classes import BY_FINGERPRINT
+from dreamfleet.common.runs.lookup import load_controller_of
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
-from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL
+from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.common.runs.run_provenance import RunProvenance, read_run_provenance, read_run_settings
 from dreamfleet.coordinator.settings.config import RunConfig, config_values
 from dreamfleet.coordinator.settings.freezing import freeze
@@ -104,8 +105,8 @@ class Rerun:
 
     def compare(self, folder: Path) -> RerunComparison:
         """What the run in a folder reports, with the controller."""
-        again = Controller.load(folder / CONTROLLER)
         with RunFolder(folder) as stored:
+            again = load_controller_of(stored)
             why, hosts = self._describe_difference(stored), self._describe_hosts(stored)
         if again.sha256 == self.controller.sha256:
             return RerunComparison(

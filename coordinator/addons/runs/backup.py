@@ -11,9 +11,10 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 
-from dreamfleet.common.errors import JournalError, UsageError
+from dreamfleet.common.errors import ControllerError, JournalError, UsageError
 from dreamfleet.common.files.atomic_write import fsync_path
 from dreamfleet.common.files.locks import open_lock, try_lock
+from dreamfleet.common.runs.lookup import load_controller_of
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, ROLLOUTS
@@ -94,6 +95,8 @@ def _copy_run(source: RunFolder, folder: Path) -> None:
         shutil.copy2(source.bundle_path, folder / BUNDLE)
     with RunFolder(folder) as copy:
         copy.verify()
+        with suppress(ControllerError):  # it has none yet, or another run's, which nobody takes for its own
+            load_controller_of(copy).save(copy.controller_path)
         drives = copy.rollouts()
     if drives:
         (folder / ROLLOUTS).mkdir()
@@ -104,7 +107,7 @@ def _copy_run(source: RunFolder, folder: Path) -> None:
 
 
 def _copy_controller_and_journal(source: RunFolder, folder: Path) -> None:
-    """The controller first: it may lag behind the journal, as after a kill, and must not be ahead of it.
+    """The controller first: where it lags behind the journal, the copy's follows it; it must not be ahead.
 
     A recall in between takes back what the controller follows from: then both are copied again.
     """

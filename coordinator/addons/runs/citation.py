@@ -34,7 +34,8 @@ def citation_facts(run: RunFolder) -> dict[str, Any]:
     return {
         "run": run.name, "run_uid": run.uid, "created": run.created, "ended": run.ended,
         "ended_at": run.ended_at, "lasted_seconds": run.duration_seconds,
-        "controller": controller.sha256, "bundle": settings.task.bundle or None,
+        "controller": controller.sha256, "generation": controller.provenance.get("generation"),
+        "bundle": settings.task.bundle or None,
         "score": view.score, "failed_episodes": view.reported.failed if view.reported else 0,
         "failed_candidates": count_failed(history), "replaced_seeds": run.count_reseeds(history),
         "on_failure": settings.on_failure,
@@ -72,12 +73,14 @@ def _rows(
     at = "" if lasted is None else f" at {run.ended_at}, {format_duration(lasted)} after it began"
     since, state = run.created or "at an unknown time", f"ended after {run.ended}{at}" if run.ended else "open"
     yield "run", f"`{run.uid}`, begun {since}, {state}"
-    yield "controller", f"SHA-256 `{controller.sha256}` of its parameters"
+    history, written = run.history(), controller.provenance.get("generation")
+    lags = view.reported is None and history and written != history[-1].number  # a mean that is in no journal
+    after = f", the mean of generation {written}: that of {history[-1].number} is not written yet" if lags else ""
+    yield "controller", f"SHA-256 `{controller.sha256}` of its parameters{after}"
     yield "world model", f"SHA-256 `{spec.bundle}`" if spec.bundle else "none"
     yield "score", view.score
     warm = "" if spec.temperature is None else f", temperature {spec.temperature:g}"
     warm += f", end {spec.end}" if spec.end else ""
-    history = run.history()
     generations = plural(len(history), "generation")
     if settings.stages:  # each has a horizon, a population and more of its own
         begun = begun_stages(settings, history, run.evaluations())
@@ -114,7 +117,7 @@ def _rows(
 def _commands(run: RunFolder) -> dict[str, str]:
     """Commands that check the run, keyed by what they show."""
     last, classes = max((each.number for each in run.history()), default=0), run.classes
-    beside, controller = ("--runs-dir", str(run.path.parent)), str(run.controller_path)
+    beside = ("--runs-dir", str(run.path.parent))
     first = ("--candidate", f"{last}/0")
     one, whole = "bit-identical on any host of its class", "bit-identical"
     if classes.mixed:
@@ -126,7 +129,7 @@ def _commands(run: RunFolder) -> dict[str, str]:
     words = {
         f"one candidate's fitness again, {one}": ("verify", "candidate", run.name, *first, *beside, *trust),
         f"the whole run again, {whole}": ("verify", "run", run.name, *beside, *trust_all),
-        "its score on unseen seeds": ("evaluate", "--controller", controller, "--episodes", "100", *trust),
+        "its score on unseen seeds": ("evaluate", "--controller", str(run.path), "--episodes", "100", *trust),
     }
     return {why: shlex.join(("dreamfleet", *each)) for why, each in words.items()}
 

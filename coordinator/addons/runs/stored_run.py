@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 from dreamfleet.common.addons.analysis.elites import RunArchive, controller_of, tables
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.errors import ControllerError, JournalError, MissingExtraError, UsageError
+from dreamfleet.common.errors import JournalError, MissingExtraError, UsageError
 from dreamfleet.common.host.packages import install_command
 from dreamfleet.common.printable import plural
 from dreamfleet.common.runs import run_folder, run_paths
+from dreamfleet.common.runs.lookup import load_controller_of
 from dreamfleet.common.runs.records import best_evaluation, format_mean, in_values
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.schema.display import Displayed
@@ -61,12 +62,7 @@ class StoredRun(RunFolder, Displayed):
 
     def controller(self) -> Controller:
         """The controller that the run reports; `ControllerError` before its first generation is closed."""
-        try:
-            return Controller.load(self.controller_path)
-        except ControllerError as error:
-            if self.history():
-                raise
-            raise ControllerError(f"run {self.name} has no controller before its first generation is closed") from error
+        return load_controller_of(self)
 
     def bundle(self) -> Bundle | None:
         """The run's own copy of its world model, for `evaluate` and `predict`; `None` if it has none."""

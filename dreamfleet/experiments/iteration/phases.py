@@ -17,7 +17,7 @@ from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.host.stop_signals import Stop
-from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
+from dreamfleet.common.runs.lookup import find_bundle_of, find_controller, load_controller_of
 from dreamfleet.common.runs.records import StoredEvaluation, best_evaluation
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import BUNDLE as RUN_BUNDLE
@@ -221,7 +221,7 @@ class PhaseRunner:
 
     def _pilots(self, run: RunFolder, folder: Path) -> tuple[list[Path], list[int]]:
         """Save the means that drive for the next round, beside a link to their world model; paths and generations."""
-        reported = Controller.load(run.controller_path)
+        reported = load_controller_of(run)
         generation = reported.provenance.get("generation")
         others = other_means(run.evaluations(), generation, self._config.means - 1)
         vectors = [reported.parameters, *(run.evaluated_mean(each) for each in others)]

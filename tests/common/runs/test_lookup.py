@@ -1,17 +1,25 @@
+import json
 import re
 import shlex
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.bundle_store import find_bundle, pretrained_folder
+from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.subspace import Subspace
-from dreamfleet.common.errors import ConnectionFailedError, UsageError
+from dreamfleet.common.errors import ConnectionFailedError, ControllerError, UsageError
 from dreamfleet.common.runs import lookup
-from dreamfleet.common.runs.lookup import find_subspace, naming_the_stored_run
+from dreamfleet.common.runs.lookup import find_controller, find_subspace, naming_the_stored_run
+from dreamfleet.common.runs.run_paths import CONTROLLER
+from dreamfleet.coordinator.addons.runs.stored_run import open_run
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.storage.journal import Journal
+from tests.support.journals import confirm
+from tests.support.processes import call_here, printed
 
 
 def test_a_subspace_is_a_shipped_one_of_a_shipped_world_model_or_a_file(tmp_path, monkeypatch):
@@ -50,3 +58,41 @@ def test_where_no_coordinator_answers_the_stored_run_is_named(tmp_path, random_b
     journal.close()
     assert re.search("night .*3 generations", refused("night"))
     assert shlex.split(refused(None).split("`")[1])[1:] == ["runs", "list", "--runs-dir", str(tmp_path)]
+
+
+def test_a_controller_that_lags_behind_the_journal_is_the_one_that_the_journal_reports(runs):
+    written = Controller.load(runs / "reality" / CONTROLLER)
+    old = replace(written, parameters=written.parameters + 1, provenance=written.provenance | {"generation": 0})
+    old.save(runs / "reality" / CONTROLLER)
+    for name, folder in (("reality", runs), (str(runs / "reality"), runs / "elsewhere")):
+        found, _ = find_controller(name, folder)
+        assert (found.sha256, found.provenance | written.provenance) == (written.sha256, found.provenance)
+    with open_run("reality", runs) as run:
+        assert run.controller().sha256 == written.sha256
+    assert json.loads(printed("runs", "receipt", "reality", "--json"))["controller"] == written.sha256
+    printed("runs", "backup", "reality", "--to", runs / "safe")
+    assert Controller.load(runs / "safe" / "reality" / CONTROLLER).sha256 == written.sha256
+
+
+def test_a_confirmed_mean_goes_before_the_best_evaluated_one(runs):
+    with open_run("reality", runs) as run:
+        generation, closed = min(each.generation for each in run.evaluations()), len(run.history())
+        vector = run.evaluated_mean(generation)
+    confirm(runs / "reality", generation, 4, 2.5, 0.5, closed)
+    found, _ = find_controller("reality", runs)
+    assert (found.parameters == vector).all()
+    assert [found.provenance[each] for each in ("generation", "validation_mean", "confirmed")] == [
+        generation,
+        2.5,
+        True,
+    ]
+
+
+def test_another_runs_controller_is_refused(runs):
+    shutil.copyfile(runs / "hidden" / CONTROLLER, runs / "reality" / CONTROLLER)
+    with pytest.raises(ControllerError, match="reality"):
+        find_controller("reality", runs)
+    assert call_here("runs", "receipt", "reality")[0] == 1
+    printed("runs", "backup", "reality", "--to", runs / "safe")
+    with pytest.raises(ControllerError, match="reality"):
+        find_controller("reality", runs / "safe")

@@ -13,7 +13,7 @@ from dreamfleet.common.artifacts.bundle_store import find_bundle, shipped_names
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import BundleError, ControllerError, JournalError, UsageError
 from dreamfleet.common.files.regular_files import is_file
-from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
+from dreamfleet.common.runs.lookup import find_bundle_of, find_controller, load_controller_of
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.worker.scoring.actors import Actor, ControllerActor, Floats
 from dreamfleet.worker.tasks.api import Policy
@@ -55,7 +55,7 @@ def find_subject(name: str | None, runs_dir: Path) -> Iterator[InspectionSubject
         if bundle is None or not run.controller_path.exists():
             yield InspectionSubject(bundle, run=run)
             return
-        controller = Controller.load(run.controller_path)
+        controller = load_controller_of(run)
         yield InspectionSubject(bundle.for_controller(controller), controller, run)
 
 

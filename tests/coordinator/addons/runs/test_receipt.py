@@ -72,6 +72,15 @@ def test_a_run_without_a_controller_says_why(reality):
     assert (code, "reality" in error) == (1, True)
 
 
+def test_the_generation_of_a_mean_that_was_not_evaluated_is_named_where_it_is_not_the_last(reality):
+    change_journal(reality, "DELETE FROM evaluation")
+    whole = printed("runs", "receipt", "reality")
+    change_provenance(reality, generation=0, validation_mean=None)
+    assert receipt()["generation"] == 0
+    former, now = (set(text.splitlines()) for text in (whole, printed("runs", "receipt", "reality")))
+    assert [each.startswith("- controller: ") for each in (*former - now, *now - former)] == [True, True]
+
+
 def test_replaced_seeds_are_counted(reality):
     with RunFolder(reality) as run:
         later = training_seeds(run.settings.seed, 1, run.settings.episodes, 2)

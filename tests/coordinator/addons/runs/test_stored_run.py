@@ -93,5 +93,5 @@ def test_its_controller_and_world_model_are_those_of_its_folder(reality):
     with pytest.raises(BundleError, match="bundle"):
         reality.bundle()
     reality.controller_path.unlink()
-    with pytest.raises(ControllerError, match=r"reality\b.*controller\.npz"):
+    with pytest.raises(ControllerError, match="reality"):
         reality.controller()
