@@ -5,6 +5,7 @@ __all__ = [
     "command_lines",
     "isolated",
     "kept_document",
+    "kept_words",
     "function_names",
     "run_arguments",
     "search_arguments",

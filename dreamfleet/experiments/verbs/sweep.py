@@ -18,17 +18,20 @@ from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import Stop, interrupted_by_signals, stop_on_signals
 from dreamfleet.common.printable import plural
+from dreamfleet.common.protocol.tasks import module_of
+from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.settings import run_setup
 from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, RunConfig
 from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
+from dreamfleet.experiments.local.kept_words import accept, check_announced, check_kept, chosen_code
 from dreamfleet.experiments.local.local_run import free_port, load_parsed_flags
 from dreamfleet.experiments.started_run import check_settings, flag_words
 from dreamfleet.experiments.sweep import summary
 from dreamfleet.experiments.sweep.display import showing
-from dreamfleet.experiments.sweep.folder import FIGURE, StoredSweep, SweepFolder
+from dreamfleet.experiments.sweep.folder import FIGURE, SETTINGS, StoredSweep, SweepFolder
 from dreamfleet.experiments.sweep.plan import Sweep, SweepOptions, parse_vary, read_vary
 from dreamfleet.experiments.sweep.runner import RunProgress, SweepFleet, SweepRunner
 from dreamfleet.experiments.sweep.summary import RunResult
@@ -85,6 +88,7 @@ def run(args: argparse.Namespace) -> int:
         _refuse_settings(args, file)
         folder = SweepFolder(args.runs_dir, args.resume)
         stored = folder.read()
+        check_kept(_words(stored), _code_of(stored), folder.path / SETTINGS)
         stored = replace(stored, options=_options(args, file, stored.options))
     else:
         options = _options(args, file, SweepOptions())
@@ -92,6 +96,9 @@ def run(args: argparse.Namespace) -> int:
         folder = SweepFolder(args.runs_dir, sweep.name)
         folder.check_new(sweep)
         stored = StoredSweep(sweep, check_runs(sweep, args.sources), options)
+        accept(_words(stored), _code_of(replace(stored, tasks=())))
+        check_announced(stored.tasks)
+        accept(_words(stored), _code_of(stored))
     fleet = _fleet(args, stored.options)
     with folder_lock(folder.lock, "sweep of this name", "--runs-dir"), stop_on_signals() as stop:
         if not args.resume:
@@ -130,9 +137,7 @@ def check_runs(sweep: Sweep, sources: Mapping[str, Any]) -> tuple[str, ...]:
 
     `sources` are those of the verb, as `complete_arguments` left them.
     """
-    given = {*sweep.vary, *(flag.removeprefix("--").partition("=")[0] for flag in sweep.flags if flag[:2] == "--")}
-    if taken := sorted(given & set(OWN)):
-        raise UsageError(f"{taken[0]} is no setting that a sweep can give its runs: it sets it itself")
+    _check_own(sweep)
     parser = build_parser("coordinator", run_setup)
     tasks: dict[str, None] = {}
     checked: set[str] = set()
@@ -147,6 +152,27 @@ def check_runs(sweep: Sweep, sources: Mapping[str, Any]) -> tuple[str, ...]:
         except UsageError as error:
             raise UsageError(f"run {run.name} of the sweep: {error}") from error
     return tuple(tasks)
+
+
+def _check_own(sweep: Sweep) -> None:
+    given = {*sweep.vary, *(flag.removeprefix("--").partition("=")[0] for flag in sweep.flags if flag[:2] == "--")}
+    if taken := sorted(given & set(OWN)):
+        raise UsageError(f"{taken[0]} is no setting that a sweep can give its runs: it sets it itself")
+
+
+def _words(stored: StoredSweep) -> object:
+    """What a sweep's processes do, as JSON stores it."""
+    return to_plain(replace(stored, options=SweepOptions()))
+
+
+def _code_of(stored: StoredSweep) -> dict[str, str]:
+    """The modules that a sweep's words have its processes trust, by what names each."""
+    _check_own(stored.sweep)
+    found = {f"task {task!r}": module for task in stored.tasks if (module := module_of(task))}
+    parser = build_parser("coordinator", run_setup)
+    for run in stored.sweep.runs:
+        found |= chosen_code(parser.parse_all([*stored.sweep.flags, *run.flags]))
+    return found
 
 
 def _check_settings(config: RunConfig, *, has_start: bool) -> list[str]:

@@ -1,9 +1,11 @@
 """A sweep's plan, what it keeps, and its results, without processes.
-Tests figure.py, folder.py, plan.py, summary.py and dreamfleet/experiments/verbs/sweep.py."""
+Tests figure.py, folder.py, plan.py, summary.py, dreamfleet/experiments/local/kept_words.py and
+dreamfleet/experiments/verbs/sweep.py."""
 
 import argparse
 import json
 import re
+import sys
 from dataclasses import replace
 
 import pytest
@@ -11,6 +13,7 @@ import pytest
 from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.cli.global_config import complete_arguments
 from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.host.trusted_modules import VARIABLE
 from dreamfleet.experiments.local.local_run import task_flags
 from dreamfleet.experiments.sweep import summary
 from dreamfleet.experiments.sweep.figure import sweep_figure
@@ -115,6 +118,66 @@ def test_a_sweep_is_resumed_as_it_was_served(folder):
     assert resumed("--workers", "0", "--parallel", "1") == replace(kept, workers=0, parallel=1)
     assert resumed("--connect", "tcp/a:1") == SweepOptions(2, 6, (), ("tcp/a:1",))
     assert resumed("--listen", "tcp/127.0.0.1:1") == SweepOptions(2, 6, ("tcp/127.0.0.1:1",))
+
+
+CODE_FLAGS = [
+    ("--task=function:pickle:loads",), ("--task", "mine:Task"), ("--optimiser=pickle:loads",), ("--trust=pickle",),
+    ("--environment", "x=1", "--trust", "pickle"),
+]  # fmt: skip
+
+
+def run_sweep(folder, *words):
+    args = build_parser("sweep", sweep_verb).parse_all([*words, "--runs-dir", str(folder.runs_dir)])
+    complete_arguments(args, {})
+    return sweep_verb.run(args)
+
+
+@pytest.mark.parametrize("flags", CODE_FLAGS)
+def test_a_kept_sweep_chooses_no_code(folder, flags, monkeypatch):
+    monkeypatch.setattr(sweep_verb, "_serve", lambda *_args: pytest.fail("it was served"))
+    folder.write(StoredSweep(sweep_of("seed=1", flags=(*flags, "--generations=1")), ()))
+    with pytest.raises(UsageError, match=r"--trust (pickle|mine)"):
+        run_sweep(folder, "--resume", "carts")
+
+
+@pytest.mark.parametrize(
+    "stored",
+    [
+        StoredSweep(sweep_of("seed=1"), ("function:pickle:loads",)),
+        StoredSweep(sweep_of("seed=1", "task=function:pickle:loads", flags=FLAGS[1:]), ()),
+        StoredSweep(sweep_of("seed=1", flags=(*FLAGS, "--config", "strangers.toml")), ()),
+        StoredSweep(sweep_of("seed=1", flags=(*FLAGS, "--join=strangers")), ()),
+    ],
+)
+def test_a_kept_sweep_announces_no_code_and_names_no_file_of_settings(folder, stored, monkeypatch):
+    monkeypatch.setattr(sweep_verb, "_serve", lambda *_args: pytest.fail("it was served"))
+    folder.write(stored)
+    with pytest.raises(UsageError):
+        run_sweep(folder, "--resume", "carts")
+
+
+def test_a_sweep_that_this_user_began_here_keeps_its_code(folder, tmp_path, monkeypatch):
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "swept_costs.py").write_text("def cost(x):\n    return sum(x**2)\n")
+    monkeypatch.syspath_prepend(str(tmp_path / "own"))
+    served = []
+    monkeypatch.setattr(sweep_verb, "_serve", lambda _args, stored, *_rest: served.append(stored) or [])
+    monkeypatch.setattr(sweep_verb, "_report", lambda *_args: 0)
+
+    def forget():
+        monkeypatch.setenv(VARIABLE, "")
+        monkeypatch.delitem(sys.modules, "swept_costs", raising=False)
+
+    flags = ("--task=function:swept_costs:cost", "--environment", "x0=[1.0,2.0]", "minimise=true", "--generations=1")
+    run_sweep(folder, "--run", "carts", "--vary", "seed=1", *flags)
+    forget()
+    run_sweep(folder, "--resume", "carts")
+    assert served[0].tasks == served[1].tasks == ("function:swept_costs:cost",)
+    forget()
+    changed = replace(served[0].sweep, flags=(*served[0].sweep.flags, "--population=5"))  # not this user's words
+    folder.write(replace(served[0], sweep=changed))
+    with pytest.raises(UsageError, match="--trust swept_costs"):
+        run_sweep(folder, "--resume", "carts")
 
 
 def test_a_sweep_that_is_absent_or_damaged_is_named(folder):
