@@ -104,6 +104,8 @@ class Objective:
                 raise UsageError(f"the bounds of parameter {index} are {lower:g} and {upper:g}: the lower one is above")
             if not lower <= x0 <= upper:
                 raise UsageError(f"x0 of parameter {index} is {x0:g}, outside of its bounds {lower:g} and {upper:g}")
+            if index in self.integer and not any(map(math.isinf, (lower, upper))) and math.ceil(lower) > upper:
+                raise UsageError(f"no whole number is within the bounds {lower:g} and {upper:g} of parameter {index}")
             if index in self.log and not (x0 > 0 and (lower == -math.inf or lower > 0)):
                 raise UsageError(f"parameter {index} is logarithmic: its x0 and lower bound must be above 0")
         if self.lower == self.upper:

@@ -205,6 +205,8 @@ def test_a_callback_ends_the_search_and_all_numbers_are_of_one_moment(tmp_path):
         ({"bounds": [(0, 0), (0, 0)]}, "."),
         ({"disp": True}, "`callback=print`"),
         ({"seed": "x"}, "'x'"),
+        ({"seed": -1}, "-1"),
+        ({"seed": 2**63 - 1}, str(2**63 - 1)),
         ({"function": objectives.raising}, "raising.* ZeroDivisionError"),
         ({"function": "tests.support.objectives:nowhere"}, "nowhere"),
         *(({wrong: 3}, f"'{wrong}'.* '{right}'") for wrong, right in CALLED_OTHERWISE.items()),

@@ -12,6 +12,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import plural, suggest
 from dreamfleet.coordinator.jobs.confirmation import FINALISTS, total_episodes
 
+MOST_SEED = 2**62  # a run has at most 2**63 - 1, and each restart has the next one
 STEP_SHARE = 0.3  # of a parameter's range: Hansen 2016, "The CMA Evolution Strategy: A Tutorial", section B
 OTHER_NAMES = {
     "maxfevals": "budget evaluations n_evaluations max_evaluations evals max_evals maxevals maxfun maxfev max_nfev "
@@ -64,9 +65,9 @@ def check_names(settings: Mapping[str, Any]) -> None:
 
 
 def read_seed(value: Any) -> int:
-    """The seed of a search; `UsageError` for what is no whole number."""
-    if not isinstance(value, (int, np.integer)) or isinstance(value, bool):
-        raise UsageError(f"seed must be a whole number, not {value!r:.100}")
+    """The seed of a search; `UsageError` for what is none, or leaves no further ones for its restarts."""
+    if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or not 0 <= value <= MOST_SEED:
+        raise UsageError(f"seed must be a whole number from 0 to {MOST_SEED:,}, not {value!r:.100}")
     return int(value)
 
 
@@ -104,7 +105,6 @@ def read_objective(x0: Any, sigma0: Any, bounds: Any, given: dict[str, Any]) -> 
     except (TypeError, ValueError, OverflowError) as error:
         raise UsageError(f"bounds must be pairs of numbers, not {bounds!r:.100}") from error
     indices = {name: _read_indices(name, given[name]) for name in ("integer", "log")}
-    _check_integers(lower, upper, indices["integer"])
     if sigma0 is None:
         scale = _default_steps(len(start), lower, upper, indices["log"])
     else:
@@ -113,14 +113,6 @@ def read_objective(x0: Any, sigma0: Any, bounds: Any, given: dict[str, Any]) -> 
             raise UsageError(f"sigma0 must be above 0, not {sigma0}")
     arguments = {"x0": start, "scale": scale[0] if len(scale) == 1 else scale, "lower": lower, "upper": upper}
     return Objective.of({**given, **arguments, **indices})
-
-
-def _check_integers(lower: Any, upper: Any, integer: bool | Sequence[int]) -> None:
-    """`UsageError` for bounds of a whole number between which there is none."""
-    for index, (low, high) in enumerate(zip(lower or (), upper or (), strict=True)):
-        is_whole = integer if isinstance(integer, bool) else index in integer
-        if is_whole and None not in (low, high) and math.ceil(low) > math.floor(high):
-            raise UsageError(f"no whole number is within the bounds {low:g} and {high:g} of parameter {index}")
 
 
 def _default_steps(size: int, lower: Any, upper: Any, log: bool | Sequence[int]) -> list[float]:

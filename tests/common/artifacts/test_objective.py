@@ -85,6 +85,7 @@ def test_equal_bounds_fix_a_parameter():
         {"x0": [1, 2], "lower": [1, 2], "upper": [1, 2]},
         {"x0": [1], "log": True, "lower": 0},
         *({"x0": [1], **odd} for odd in ({"integer": [1]}, {"minimise": "yes"}, {"penalty": [1, 2]}, {"step": 3})),
+        {"x0": [1, 0.5], "lower": [0, 0.2], "upper": [9, 0.9], "integer": [1]},
         {"x0": 1, "dimension": 0},
         5,
         [],
