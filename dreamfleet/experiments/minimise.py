@@ -22,7 +22,7 @@ from dreamfleet.common.runs.run_paths import default_runs_dir, run_command
 from dreamfleet.common.schema.display import Displayed
 from dreamfleet.experiments.local.function_names import name_function
 from dreamfleet.experiments.local.local_run import has_begun
-from dreamfleet.experiments.local.search_arguments import candidate_calls, check_names, read_objective, read_seed
+from dreamfleet.experiments.local.search_arguments import check_names, generations_within, read_objective, read_seed
 from dreamfleet.experiments.started_run import RunPausedError, StartedRun, start_run_in
 
 Floats = NDArray[np.float64]
@@ -108,11 +108,13 @@ def minimise(
     The search ends by `ftarget`, before it has more than `maxfevals` calls, as it converges, when `callback(progress)`
     returns `False` or raises `StopIteration`, or by a limit in `settings`, as a generation closes. Generations that
     close while the callback runs count too. `maxfevals` counts the calls for means too, and those by which a noisy
-    search confirms its best ones at the end. Only the first generation of all may exceed it. The search begins anew up
-    to `restarts` times, while a whole generation fits in, from a random point within bounds, else from `x0`: with twice
-    the population (`ipop`), or with large and small ones in turn (`bipop`). `settings` are those of `start_run`, such
-    as `generations`, `optimiser`, `episodes`, `seed` or `listen`; with `workers=0` only other hosts score. `UsageError`
-    for a wrong setting, for a function that fails at `x0`, or if all candidates fail before one has a value.
+    search confirms its best ones at the end; of a call that fails and is tried again one. Only the first generation of
+    all may exceed it. Where no mean fits in beside that, none is evaluated, and `fun` is the best candidate's value.
+    The search begins anew up to `restarts` times, while a whole generation fits in, from a random point within bounds,
+    else from `x0`: with twice the population (`ipop`), or with large and small ones in turn (`bipop`). `settings` are
+    those of `start_run`, such as `generations`, `optimiser`, `episodes`, `seed` or `listen`; with `workers=0` only
+    other hosts score. `UsageError` for a wrong setting, for a function that fails at `x0`, or if all candidates fail
+    before one has a value.
 
     >>> import dreamfleet, numpy as np
     >>> found = dreamfleet.minimise(np.linalg.norm, x0=[3, 4], sigma0=1, ftarget=0.01, workers=1)
@@ -151,6 +153,18 @@ def _is_noisy(function: Callable[..., Any] | str) -> bool:
         return takes_seed(attrgetter(name)(import_module(module)))
     except (ImportError, AttributeError) as error:
         raise UsageError(f"no function {name} of module {module} here: {error}") from error
+
+
+def _limits_within(calls: int, settings: dict[str, Any], *, is_first: bool) -> dict[str, Any]:
+    """Settings by which a search ends before it has more calls; the first one of all has one generation at least.
+
+    Where no mean fits in beside it, none is evaluated.
+    """
+    limits = {"steps": settings.get("steps") or calls}  # for stages, which may have larger generations
+    if found := generations_within(calls, settings) or not is_first:
+        return {**limits, "generations": int(found)}
+    limits |= {"evaluate_every": 0, "target": None}
+    return {**limits, "generations": generations_within(calls, {**settings, **limits}) or 1}
 
 
 class _Plan(NamedTuple):
@@ -192,7 +206,10 @@ class _Searches:
         """Search, restart while nothing else ends it, and say what was found; `UsageError` for wrong settings."""
         if kind not in ("ipop", "bipop"):
             raise UsageError(f"restart must be 'ipop' or 'bipop', not {kind!r}")
-        numbers = (("restarts", restarts, 0), ("popsize", popsize, 2), ("maxfevals", self._maxfevals, 1))
+        numbers = (
+            ("restarts", restarts, 0), ("popsize", popsize, 2), ("maxfevals", self._maxfevals, 1),
+            ("generations", self._settings.get("generations"), 0),
+        )  # fmt: skip
         for what, value, least in numbers:
             if value is not None and not (isinstance(value, (int, np.integer)) and least <= value <= MOST):
                 raise UsageError(f"{what} must be a whole number from {least} to {MOST:,}, not {value!r:.100}")
@@ -215,7 +232,7 @@ class _Searches:
         if self._settings.get("optimiser", "cma") == "cma" and size <= FULL_DIMENSION:
             self._settings.setdefault("covariance", "full")
         for number, plan in enumerate(self._plans(first, seed, restarts, kind)):
-            if number and self._budget and not candidate_calls(self._left, self._settings_of(plan)):
+            if number and self._budget and not generations_within(self._left, self._settings_of(plan)):
                 break
             own = f"{self._runs[0]}-restart-{number}" if number else name
             reason = self._run(own, plan, number)
@@ -259,7 +276,7 @@ class _Searches:
         objective = self._objective_of(plan, number)
         settings = {"run": name, "task_options": objective.options, **self._settings_of(plan)}
         if plan.calls:
-            settings.setdefault("steps", candidate_calls(plan.calls, settings) or 1)
+            settings |= _limits_within(plan.calls, settings, is_first=not number)
         with start_run_in(self._function.environment, self._workers, self._runs_dir, settings) as run:
             self._runs.append(run.name)
             self._first = len(self._history)
@@ -272,7 +289,7 @@ class _Searches:
         run.close()
         if self._has_reached:
             return StopReason(ended.kind, f"reached ftarget {format_number(self._ftarget)}")
-        if self._budget and ended.kind is StopKind.STEPS and "steps" not in self._settings:
+        if ended.kind is StopKind.GENERATIONS and settings.get("generations") != self._settings.get("generations"):
             return StopReason(ended.kind, f"maxfevals={self._budget} is reached")
         return ended
 

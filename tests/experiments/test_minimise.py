@@ -53,11 +53,27 @@ def test_a_noisy_search_gives_the_mean_that_was_judged_and_has_no_more_calls_tha
     assert not found.success
     assert "maxfevals=400" in found.message
     with dreamfleet.open_run("mine", tmp_path) as run:
-        assert run.stop_kind is StopKind.STEPS
+        assert run.stop_kind is StopKind.GENERATIONS
         generation = run.settings.population * run.settings.episodes
         assert len(run.evaluations()) > 1
         assert run.confirmation() is not None
         assert 400 - 2 * generation - run.settings.evaluation_episodes < found.nfev == run.result_count() <= 400
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*failed candidates:RuntimeWarning")
+@pytest.mark.parametrize(
+    ("function", "budget", "least", "given"),
+    [
+        (objectives.noisy, 150, 130, {"popsize": 6, "episodes": 4, "racing": True}),
+        (objectives.holed, 60, 20, {"popsize": 6, "evaluate_every": 1}),
+        (objectives.sphere, 50, 50, {"popsize": 7}),
+        (objectives.noisy, 40, 36, {"popsize": 6}),
+    ],
+)
+def test_races_failures_and_a_budget_without_a_mean_keep_to_maxfevals(function, budget, least, given, tmp_path):
+    found = dreamfleet.minimise(function, [1.1, 1], 0.3, maxfevals=budget, runs_dir=tmp_path, **{**FEW, **given})
+    assert least <= found.nfev <= budget
 
 
 @pytest.mark.slow
@@ -205,6 +221,7 @@ def test_a_callback_ends_the_search_and_all_numbers_are_of_one_moment(tmp_path):
         ({"bounds": [(0, 0), (0, 0)]}, "."),
         ({"disp": True}, "`callback=print`"),
         ({"seed": "x"}, "'x'"),
+        ({"generations": "x"}, "'x'"),
         ({"seed": -1}, "-1"),
         ({"seed": 2**63 - 1}, str(2**63 - 1)),
         ({"function": objectives.raising}, "raising.* ZeroDivisionError"),
@@ -217,6 +234,21 @@ def test_what_cannot_be_searched_is_refused_before_a_run_exists(change, named, t
     with pytest.raises(UsageError, match=named):
         dreamfleet.minimise(given.pop("function"), given.pop("x0"), given.pop("sigma0"), **given)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("calls", "is_first", "given", "limits"),
+    [
+        (5, True, {}, {"generations": 1, "evaluate_every": 0, "target": None}),
+        (51, True, {}, {"generations": 4, "evaluate_every": 0, "target": None}),
+        (5, False, {}, {"generations": 1}),
+        (52, True, {}, {"generations": 1}),
+        (400, True, {"generations": 2}, {"generations": 2}),
+    ],
+)
+def test_a_budget_below_one_generation_has_one_and_no_mean(calls, is_first, given, limits):
+    noisy = {"population": 6, "target": -1.0, **module.NOISY, **given}
+    assert module._limits_within(calls, noisy, is_first=is_first) == {"steps": calls, **limits}
 
 
 def test_the_first_step_is_a_share_of_the_range_where_bounds_are_finite():

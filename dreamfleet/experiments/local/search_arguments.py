@@ -71,30 +71,33 @@ def read_seed(value: Any) -> int:
     return int(value)
 
 
-def candidate_calls(budget: int, settings: Mapping[str, Any]) -> int:
-    """How many of `budget` calls candidates may have, so that with those for means the search has no more.
+def generations_within(budget: int, settings: Mapping[str, Any]) -> int:
+    """After how many generations a search must end so that it has at most `budget` calls; 0: not one fits in.
 
-    0 if not even one generation fits in. Every so many generations and at the end a mean is evaluated; at last the best
-    means are confirmed.
+    Every so many generations and at the end a mean is evaluated; at last the best means are confirmed. A candidate that
+    fails counts as any other.
 
     >>> means = {"evaluate_every": 10, "evaluation_episodes": 20, "confirm_episodes": 20}
-    >>> candidate_calls(400, {"population": 6, "episodes": 2, **means}), candidate_calls(400, {"population": 8})
-    (276, 400)
-    >>> candidate_calls(51, {"population": 6, "episodes": 2, **means}), candidate_calls(7, {"population": 8})
-    (0, 0)
+    >>> noisy = {"population": 6, "episodes": 2, **means}
+    >>> generations_within(400, noisy), generations_within(400, {**noisy, "racing": True})
+    (23, 31)
+    >>> generations_within(400, {"population": 8}), generations_within(51, noisy), generations_within(7, noisy)
+    (50, 0, 0)
     """
     names = ("population", "episodes", "evaluate_every", "evaluation_episodes", "confirm_episodes")
     try:
         population, episodes, every, evaluation, confirmed = (int(settings.get(name) or 0) for name in names)
+        limit = int(settings.get("generations") or budget)
     except (TypeError, ValueError):  # the run refuses them
         return budget
-    generation = max(population * max(episodes, 1), 1)
+    second = episodes // 2 if settings.get("racing") else 0  # only the better half of the candidates has these
+    generation = max(population * max(episodes, 1) - population // 2 * second, 1)
 
     def calls(generations: int) -> int:
         means = -(-generations // every) if every > 0 else 0
         return generations * generation + means * evaluation + total_episodes(min(means, FINALISTS), confirmed)
 
-    return generation * bisect_right(range(1, budget // generation + 1), budget, key=calls)
+    return min(limit, bisect_right(range(1, budget // generation + 1), budget, key=calls))
 
 
 def read_objective(x0: Any, sigma0: Any, bounds: Any, given: dict[str, Any]) -> Objective:
