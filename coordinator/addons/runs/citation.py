@@ -1,5 +1,6 @@
 """A run's provenance as a citation for papers and reports, with the commands that reproduce it."""
 
+import re
 import shlex
 from collections.abc import Iterator
 from contextlib import suppress
@@ -7,10 +8,11 @@ from dataclasses import asdict
 from importlib.metadata import metadata
 from typing import Any
 
+from dreamfleet.common.addons.markdown import as_code, as_text, fence_of
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import BundleError
-from dreamfleet.common.printable import format_duration, plural
+from dreamfleet.common.printable import format_duration, one_line, plural
 from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.runs.lookup import load_controller_of
 from dreamfleet.common.runs.records import SUBMITTED, RunSettings, count_failed, describe_failed
@@ -58,60 +60,62 @@ def format_markdown(run: RunFolder) -> str:
     """The same as Markdown: a list, the commands, and BibTeX entries of the run and the software."""
     controller = load_controller_of(run)
     receipt, settings = read_run_provenance(controller), read_run_settings(controller)
-    rows = [f"- {name}: {value}" for name, value in _rows(run, controller, receipt, settings)]
+    rows = [f"- {as_text(name)}: {value}" for name, value in _rows(run, controller, receipt, settings)]
     commands = [f"{command}   # {why}" for why, command in _commands(run).items()]
     entries = _bibtex(run, controller, receipt)
-    parts = [f"# Run {run.name}", "", *rows, "", "```sh", *commands, "```", "", "```bibtex", *entries, "```"]
-    return "\n".join(parts)
+    fence = fence_of("\n".join([*commands, *entries]))
+    blocks = [f"{fence}sh", *commands, fence, "", f"{fence}bibtex", *entries, fence]
+    return "\n".join([f"# Run {as_text(run.name)}", "", *rows, "", *blocks])
 
 
 def _rows(
     run: RunFolder, controller: Controller, receipt: RunProvenance, settings: RunSettings
 ) -> Iterator[tuple[str, str]]:
+    """Names as text and values as Markdown: what a file says is quoted, since others may have written it."""
     spec, view = settings.task, view_of(run)
     lasted = run.duration_seconds
     at = "" if lasted is None else f" at {run.ended_at}, {format_duration(lasted)} after it began"
     since, state = run.created or "at an unknown time", f"ended after {run.ended}{at}" if run.ended else "open"
-    yield "run", f"`{run.uid}`, begun {since}, {state}"
+    yield "run", f"{as_code(run.uid)}, {as_text(f'begun {since}, {state}')}"
     history, written = run.history(), controller.provenance.get("generation")
     lags = view.reported is None and history and written != history[-1].number  # a mean that is in no journal
     after = f", the mean of generation {written}: that of {history[-1].number} is not written yet" if lags else ""
-    yield "controller", f"SHA-256 `{controller.sha256}` of its parameters{after}"
-    yield "world model", f"SHA-256 `{spec.bundle}`" if spec.bundle else "none"
-    yield "score", view.score
+    yield "controller", f"SHA-256 `{controller.sha256}` of its parameters{as_text(after)}"
+    yield "world model", f"SHA-256 {as_code(spec.bundle)}" if spec.bundle else "none"
+    yield "score", as_text(view.score)
     warm = "" if spec.temperature is None else f", temperature {spec.temperature:g}"
     warm += f", end {spec.end}" if spec.end else ""
     generations = plural(len(history), "generation")
     if settings.stages:  # each has a horizon, a population and more of its own
         begun = begun_stages(settings, history, run.evaluations())
-        yield "task", f"{spec.task}{warm}, version {spec.version}"
-        yield "search", f"{settings.optimiser}, {settings.covariance}, {generations}"
-        yield from describe_stages(settings, begun).items()
+        yield "task", as_code(spec.task) + as_text(f"{warm}, version {spec.version}")
+        yield "search", as_text(f"{settings.optimiser}, {settings.covariance}, {generations}")
+        yield from ((name, as_text(text)) for name, text in describe_stages(settings, begun).items())
     else:
-        yield "task", f"{spec.task}, {view.steps}{warm}, version {spec.version}"
+        yield "task", as_code(spec.task) + as_text(f", {view.steps}{warm}, version {spec.version}")
         size = f"population {settings.population} x {plural(settings.episodes, 'episode')}, sigma0 {settings.sigma0:g}"
         own = f"{settings.optimiser}, {settings.covariance}, {size}, {generations}"
-        yield "search", f"{SUBMITTED}, {generations}" if settings.is_external else own
-    yield "failed candidates", describe_failed(settings, history, run.count_reseeds(history))
+        yield "search", as_text(f"{SUBMITTED}, {generations}" if settings.is_external else own)
+    yield "failed candidates", as_text(describe_failed(settings, history, run.count_reseeds(history)))
     so_far = "" if run.ended else "; so far, with the results of the open generation"
-    yield "spent", f"{run.total_effort().describe(run.spec.task)}{so_far}"
+    yield "spent", as_text(f"{run.total_effort().describe(run.spec.task)}{so_far}")
     yield "seed", f"{settings.seed}; training seeds follow from it, from {TRAINING_FIRST} up"
     for what, (first, count) in (receipt.seeds or {}).items():
         yield f"seeds of the {what}", f"{first} to {first + count - 1}"
     if receipt.start is not None:
-        yield "begun at", f"{receipt.start.source}, SHA-256 `{receipt.start.sha256}`"
+        yield "begun at", f"{as_text(receipt.start.source)}, SHA-256 {as_code(receipt.start.sha256)}"
     if settings.subspace:
-        yield "subspace", f"SHA-256 `{settings.subspace}`"
+        yield "subspace", f"SHA-256 {as_code(settings.subspace)}"
     if receipt.classes is not None:
-        yield "hosts", receipt.classes.description
-        yield from ((f"class {name}", hosts) for name, hosts in receipt.classes.rows)
+        yield "hosts", as_text(receipt.classes.description)
+        yield from ((f"class {name}", as_text(hosts)) for name, hosts in receipt.classes.rows)
     elif receipt.fingerprint is not None:
         others = ", and others: no run on one host is bit-identical" if receipt.mixed else ""
-        yield "hosts", f"`{receipt.fingerprint}`{others}"
+        yield "hosts", f"{as_code(receipt.fingerprint)}{others}"
     if receipt.checks is not None:
-        yield "checked on other hosts", receipt.checks.description
+        yield "checked on other hosts", as_text(receipt.checks.description)
     if receipt.versions is not None:
-        yield "coordinator", ", ".join(f"{name} {version}" for name, version in receipt.versions.items())
+        yield "coordinator", as_text(", ".join(f"{name} {version}" for name, version in receipt.versions.items()))
 
 
 def _commands(run: RunFolder) -> dict[str, str]:
@@ -143,13 +147,13 @@ def _task_modules(run: RunFolder) -> list[str]:
 
 
 def _bibtex(run: RunFolder, controller: Controller, receipt: RunProvenance) -> list[str]:
-    version, begun = (receipt.versions or {}).get("dreamfleet", ""), parse_time(run.created)
+    version, begun = _field((receipt.versions or {}).get("dreamfleet", "")), parse_time(run.created)
+    about = f"run {_field(run.uid)}, controller SHA-256 {controller.sha256}"
     return [
         f"@misc{{dreamfleet-{run.name},",
         f"  title = {{Run {run.name} of dreamfleet {version}}},",
         *([] if begun is None else [f"  year = {{{begun.year}}},"]),
-        "  note = "
-        f"{{run {run.uid}, controller SHA-256 {controller.sha256}, {plural(len(run.history()), 'generation')}}}",
+        f"  note = {{{about}, {plural(len(run.history()), 'generation')}}}",
         "}",
         "@misc{dreamfleet,",
         ",\n".join(f"  {name} = {{{text}}}" for name, text in _software_fields(receipt) if text),
@@ -159,5 +163,10 @@ def _bibtex(run: RunFolder, controller: Controller, receipt: RunProvenance) -> l
 
 def _software_fields(receipt: RunProvenance) -> Iterator[tuple[str, str]]:
     """The software's BibTeX fields. Without braces of its own, `authors` would be the authors' family name."""
-    for name, text in software_facts(receipt).items():
+    for name, text in ((name, _field(text)) for name, text in software_facts(receipt).items()):
         yield ("author", f"{{{text}}}") if name == "authors" else (name, text)
+
+
+def _field(text: str) -> str:
+    """A text as a BibTeX field on one line, which nothing in it ends."""
+    return re.sub(r"[{}\\]", "", one_line(text))

