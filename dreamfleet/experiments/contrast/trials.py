@@ -19,6 +19,7 @@ from dreamfleet.experiments.contrast.summary import TrialResult
 from dreamfleet.experiments.local.command_lines import options
 from dreamfleet.experiments.local.isolated import run_isolated
 from dreamfleet.experiments.local.kept_document import read_document, write_document
+from dreamfleet.experiments.local.kept_words import check_announced
 from dreamfleet.experiments.local.local_run import LocalFleet, coordinator_words, evolve, has_ended, task_flags
 from dreamfleet.experiments.pipeline import read_training
 from dreamfleet.worker.training.stages.bundle import BundleRequest, build_bundle
@@ -81,6 +82,7 @@ class Trials:
         if not has_ended(self._runs, trial.name):
             fleet, world = self._local_fleet(), Bundle.open(model).manifest.task
             on_step(f"{trial.name}: evolve in the dream of {world}, from the preset {default_run_preset(world)}")
+            check_announced([world])
             fleet = replace(fleet, worker=(*fleet.worker, *task_flags(world)))
             flags = (*self._contrast.run_flags_in(world), *options(bundle=model, seed=trial.seed))
             words = coordinator_words(trial.name, self._runs, fleet, lambda: flags)

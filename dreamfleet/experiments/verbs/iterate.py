@@ -12,10 +12,12 @@ from dreamfleet.common.artifacts.actions import one_hot
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.world_facts import WorldFacts
+from dreamfleet.common.cli.command_line import Configurable, build_parser
 from dreamfleet.common.cli.config import add_flags, configured_values, load
 from dreamfleet.common.cli.global_config import add_global_flags, load_credentials, security_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next, print_rows
 from dreamfleet.common.cli.presets import default_run_preset
+from dreamfleet.common.cli.world_flags import OPTIONS
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.locks import folder_lock
 from dreamfleet.common.files.regular_files import is_file
@@ -23,19 +25,24 @@ from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.stop_signals import Stop, interrupted_by_signals, stop_on_signals
 from dreamfleet.common.printable import plural
 from dreamfleet.common.transport.network import Network
+from dreamfleet.coordinator.settings import run_setup
 from dreamfleet.coordinator.settings.config import DEFAULT_BUNDLE, DEFAULT_HORIZON, RunConfig, default_world
 from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.settings.start import find_start
 from dreamfleet.experiments.iteration import summary
-from dreamfleet.experiments.iteration.config import IterateConfig
+from dreamfleet.experiments.iteration.config import RUN_FLAGS, IterateConfig
 from dreamfleet.experiments.iteration.layout import IterationFolder
 from dreamfleet.experiments.iteration.ledger import FinishedPhase, IterationLedger
 from dreamfleet.experiments.iteration.phases import find_init
 from dreamfleet.experiments.iteration.plan import INIT, Phase
 from dreamfleet.experiments.iteration.runner import Iteration
 from dreamfleet.experiments.iteration.summary import format_entry
+from dreamfleet.experiments.local.kept_words import accept, check_kept, chosen_code
 from dreamfleet.experiments.local.local_run import LocalFleet, parse_run_flags, task_flags
+from dreamfleet.worker.addons.bundles import verb as bundle_verb
+from dreamfleet.worker.training.stages.train import MODELS
+from dreamfleet.worker.verbs import train
 
 SUMMARY = (
     "make world models and evolve in their dreams in turn; each world model learns from drives of the last evolution"
@@ -46,6 +53,12 @@ FIRST = (
     "--listen --json"
 )
 PACKAGES = ("gymnasium", "matplotlib", "onnx", "onnxruntime", "safetensors", "torch")
+# The settings that are flags of other verbs: the verb, and what its parser needs before them.
+WORDS: dict[str, tuple[str, Configurable, tuple[str, ...]]] = {
+    **{f"{model}_flags": ("train", train, (model, "--data", ".")) for model in MODELS},
+    "bundle_flags": ("bundle", bundle_verb, ("--data", ".", "--out", ".")),
+    **dict.fromkeys(RUN_FLAGS, ("coordinator", run_setup, ())),
+}
 VARYING = ("preset", "schedule", "bundle", "loaded_subspace")  # to the rounds' runs, of all settings
 
 
@@ -90,6 +103,7 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
     more = (*file, *(() if named else ("--preset", default_run_preset(config.task))))
     first, limits = parse_run_flags([*more, *config.flags_of_run(1)], args.sources, "iterate")
     later, _ = parse_run_flags([*more, *config.flags_of_run(2)], args.sources, "iterate")  # wrong flags end it now
+    _check_code(args, config, layout.ledger if begun else None)
     task = first.task or config.task or default_world()
     settings = {**asdict(first), **asdict(limits), **dict.fromkeys(VARYING), "task": task}
     settings["horizon"] = first.horizon or DEFAULT_HORIZON  # as it was when that was every world's default
@@ -123,6 +137,24 @@ def _open_iteration(args: argparse.Namespace, layout: IterationFolder, stop: Sto
     iteration.begin()
     iteration.ledger.save(layout.ledger)
     return iteration
+
+
+def _check_code(args: argparse.Namespace, config: IterateConfig, keeper: Path | None) -> None:
+    """`UsageError` where settings that `keeper` has, and the user gives not now, choose code that is not trusted."""
+    given = {*configured_values(IterateConfig, "iterate", args.sources["file"], args.sources["environment"])}
+    for name, (verb, module, before) in WORDS.items():
+        parsed = build_parser(verb, module).parse_all([*before, *config.flags(name)])
+        _check_words(name, getattr(config, name), chosen_code(parsed), None if name in args.given | given else keeper)
+    world = [getattr(config, name) for name in ("task", *OPTIONS)]
+    code = chosen_code(argparse.Namespace(task=config.task, config=None))
+    _check_words("task", world, code, None if "task" in args.given | given else keeper)
+
+
+def _check_words(name: str, words: object, code: dict[str, str], keeper: Path | None) -> None:
+    if keeper is None:
+        accept([name, words], code)
+    else:
+        check_kept([name, words], code, keeper)
 
 
 def _check_run(config: IterateConfig, run: RunConfig, layout: IterationFolder) -> None:

@@ -1,13 +1,19 @@
 """What is finished, as the folder keeps it. Tests dreamfleet/experiments/local/kept_document.py."""
 
+import argparse
 import json
 from dataclasses import replace
 
 import pytest
 
+from dreamfleet.common.cli.command_line import build_parser
+from dreamfleet.common.cli.global_config import complete_arguments
 from dreamfleet.common.errors import DatasetError, UsageError
+from dreamfleet.common.host.stop_signals import never_stop
+from dreamfleet.common.host.trusted_modules import VARIABLE
 from dreamfleet.experiments.iteration.config import IterateConfig
 from dreamfleet.experiments.iteration.ledger import Artefact, IterationLedger
+from dreamfleet.experiments.verbs import iterate as iterate_verb
 from tests.support.ledgers import RUN, entry, ledger, requests
 
 
@@ -94,3 +100,42 @@ def test_a_world_that_is_kept_is_the_same_when_it_is_read(tmp_path):
     assert begun.with_settings(again, RUN, tmp_path).settings["task"] == "gym:Some-v0"
     with pytest.raises(UsageError, match=r"task gym:Some-v0.* gym:Other-v0"):
         begun.with_settings(replace(again, task="gym:Other-v0"), RUN, tmp_path)
+
+
+def check_code(config, keeper, *given, environment=None):
+    sources = {"file": {}, "environment": environment or {}}
+    iterate_verb._check_code(argparse.Namespace(given=frozenset(given), sources=sources), config, keeper)
+
+
+CODE = {
+    "run_flags": "--generations 1 --optimiser strangers_choice:f",
+    "later_run_flags": "--trust strangers_choice",
+    "vae_flags": "--updates 1 --trust strangers_choice",
+    "mdnrnn_flags": "--config strangers_choice.toml",
+    "bundle_flags": "--trust=strangers_choice",
+    "task": "gym:strangers_choice:Env-v0",
+}
+
+
+@pytest.mark.parametrize("name", CODE)
+def test_a_kept_setting_chooses_no_code_and_one_of_the_user_is_known_again(tmp_path, name, monkeypatch):
+    config, keeper = replace(IterateConfig(), **{name: CODE[name]}), tmp_path / "iteration.json"
+    with pytest.raises(UsageError, match="strangers_choice"):
+        check_code(config, keeper, "rounds")
+    check_code(config, keeper, name)  # it is given now
+    monkeypatch.setenv(VARIABLE, "")
+    if name != "mdnrnn_flags":
+        check_code(config, keeper)  # this user gave it here before
+    monkeypatch.setenv(VARIABLE, "")
+    other = "gym:strangers_choice:Env-v1" if name == "task" else f"{CODE[name]} --log-level info"
+    with pytest.raises(UsageError, match="strangers_choice"):
+        check_code(replace(config, **{name: other}), keeper)
+
+
+def test_a_resumed_iteration_is_checked_before_anything_starts(tmp_path):
+    layout = iterate_verb.IterationFolder(tmp_path)
+    ledger().begin(replace(IterateConfig(), run_flags=CODE["run_flags"]), {}).save(layout.ledger)
+    args = build_parser("iterate", iterate_verb).parse_all(["--data", str(tmp_path)])
+    complete_arguments(args, {})
+    with pytest.raises(UsageError, match="--trust strangers_choice"):
+        iterate_verb._open_iteration(args, layout, never_stop)
