@@ -17,7 +17,12 @@ TWO_DECADES = 100
 
 def is_minimised(task: TaskSpec) -> bool:
     """Whether the task is a function that is minimised, so that its values are the negated fitness."""
-    return is_function_task(task.task) and _minimises(task.options)
+    return minimises(task.task, task.options)
+
+
+def minimises(task: str, options: str) -> bool:
+    """`is_minimised`, of a task's name and its options as a run freezes them."""
+    return is_function_task(task) and _minimises(options)
 
 
 @lru_cache(maxsize=64)

@@ -54,14 +54,15 @@ class EpisodeResults(Displayed):
 
     drives: tuple[EpisodeResult, ...]
     failed: tuple[FailedEpisode, ...] = ()
+    minimised: bool = False  # whether a score is the negated value of a function, which texts show
 
     def _display(self) -> tuple[str, dict[str, object]]:
-        score = format_with_error(self.mean, self.error)
-        extremes = f"{self.worst:zg} to {self.best:zg}"
+        score = format_with_error(self.shown(self.mean), self.error)
+        extremes = f"{self.shown(self.worst):zg} to {self.shown(self.best):zg}"
         failed = f", {len(self.failed)} failed" if self.failed else ""
         facts = {
             "mean ± standard error": score,
-            "median": self.median,
+            "median": self.shown(self.median),
             "worst to best": extremes,
             "episodes": len(self.drives),
             "failed": self.failure_text or None,
@@ -72,14 +73,18 @@ class EpisodeResults(Displayed):
         return f"EpisodeResults of {plural(len(self.drives), 'episode')}: {score}, {extremes}{failed}", facts
 
     @classmethod
-    def of(cls, episodes: Iterable[EpisodeResult | FailedEpisode]) -> EpisodeResults:
+    def of(cls, episodes: Iterable[EpisodeResult | FailedEpisode], *, minimised: bool = False) -> EpisodeResults:
         """From episodes in any order; `DreamfleetError` if none has a score."""
         ordered = sorted(episodes, key=lambda each: each.seed)
         failed = tuple(each for each in ordered if isinstance(each, FailedEpisode))
-        found = cls(tuple(each for each in ordered if isinstance(each, EpisodeResult)), failed)
+        found = cls(tuple(each for each in ordered if isinstance(each, EpisodeResult)), failed, minimised)
         if not found.drives:
             raise DreamfleetError(f"no episode has a score: {found.failure_text}")
         return found
+
+    def shown(self, score: float) -> float:
+        """What texts and pictures show of a score."""
+        return 0.0 - score if self.minimised else score  # of zero no negative one
 
     @property
     def failure_text(self) -> str:

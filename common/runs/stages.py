@@ -13,6 +13,7 @@ from itertools import groupby
 from typing import Any
 
 from dreamfleet.common.printable import format_number, plural
+from dreamfleet.common.protocol.function_values import value_of
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.records import (
     STAGE_FIELDS,
@@ -276,7 +277,8 @@ class StageTracker:
         if end.steps and self._steps >= end.steps:
             return f"{self._steps:,} environment steps of stage {self._begun[-1].stage.number}"
         if (found := self._find_reached(finished)) is not None:
-            return f"the mean of generation {found.generation} reached {format_number(found.mean)}"
+            reached = format_number(value_of(found.mean, self._begun[-1].stage.settings.task))
+            return f"the mean of generation {found.generation} reached {reached}"
         return ""
 
     def _find_reached(self, finished: Mapping[int, StoredEvaluation]) -> StoredEvaluation | None:

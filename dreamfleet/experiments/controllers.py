@@ -11,6 +11,7 @@ from dreamfleet.common.artifacts.trained_agent import TrainedAgent
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.trusted_modules import trust_meanwhile
+from dreamfleet.common.protocol.function_values import minimises
 from dreamfleet.common.runs import lookup, run_paths
 from dreamfleet.common.runs.episode_results import EpisodeResults
 from dreamfleet.common.runs.seeds import TEST
@@ -97,7 +98,9 @@ def evaluate(
         raise UsageError("episodes and jobs must be at least 1, first_seed at least 0")
     seeds = tuple(range(first_seed, first_seed + episodes))
     with trust_meanwhile():
-        return EpisodeResults.of(evaluation.evaluate(_agent(controller, bundle), seeds, jobs or usable_cores()))
+        agent = _agent(controller, bundle)
+        found = evaluation.evaluate(agent, seeds, jobs or usable_cores())
+        return EpisodeResults.of(found, minimised=minimises(agent.task, agent.options))
 
 
 def _agent(controller: Controller | TrainedAgent, bundle: Bundle | None) -> Agent:

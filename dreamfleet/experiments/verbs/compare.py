@@ -111,7 +111,8 @@ def _compare_reports(args: argparse.Namespace, paths: Sequence[Path]) -> int:
             note = f"note: {first} and {path} are of different {OTHER_CAUSES[what]}: {one!r} and {other!r}"
             print(note, file=sys.stderr)
         found = PairedDifference.between(base.results, each.results)
-        lines += [_line(path, each), f"{path} less {first}: {found.description}"]
+        text = found.describe(minimised=base.results.minimised and each.results.minimised)
+        lines += [_line(path, each), f"{path} less {first}: {text}"]
         figures = {**asdict(found), "clear": found.is_significant}
         rows.append({"report": path, "against": first, **figures, "differing_facts": differing})
     print_answer(args, "\n".join(lines), differences=rows)
@@ -119,7 +120,7 @@ def _compare_reports(args: argparse.Namespace, paths: Sequence[Path]) -> int:
 
 
 def _line(path: Path, found: EvaluationReport) -> str:
-    score = format_with_error(found.results.mean, found.results.error)
+    score = format_with_error(found.results.shown(found.results.mean), found.results.error)
     failed = f", and {len(found.failed)} failed" if found.failed else ""
     return f"{path}: {found.name}, {score} on {plural(len(found.drives), score_word(found.world))}{failed}"
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.runs.records import RunSettings, StageSettings, StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.stages import StageTracker, begun_stages, describe_stages, stage_at, stages_of
 from tests.support.samples import SPEC
@@ -63,6 +64,14 @@ def test_another_population_or_step_size_starts_a_new_search():
 )
 def test_a_stage_ends_after_its_own_generations_or_steps_or_by_a_score(stages, means, found):
     assert numbers(scheduled(*stages), history(8), evaluated(means)) == found
+
+
+def test_the_score_that_ends_a_stage_of_a_minimised_function_is_its_value():
+    options = Objective.of({"dimension": 2, "x0": 0, "minimise": True}).options
+    settings = scheduled(StageSettings(score=-2.5), StageSettings(horizon=50))
+    for task, shown in (("function:mine:cost", 2.5), (PLAIN.task.task, -2.5)):
+        found = replace(settings, task=replace(settings.task, task=task, options=options))
+        assert float(begun_stages(found, history(6), evaluated({1: -2.5}))[-1].why.split()[-1]) == shown
 
 
 def test_scores_of_earlier_stages_or_unscheduled_evaluations_end_no_stage():

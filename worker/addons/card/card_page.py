@@ -129,8 +129,9 @@ def _describe_video(contents: CardContents) -> str:
         return f"{score} in its first {plural(filmed.steps, 'step')}."
     if contents.report is None:
         return f"{score}."
-    mean = format_with_error(contents.report.results.mean, contents.report.results.error)
-    return f"{score}: a median drive of {len(contents.report.drives)}, whose mean is {mean}."
+    results = contents.report.results
+    mean = format_with_error(results.shown(results.mean), results.error)
+    return f"{score}: a median drive of {len(results.drives)}, whose mean is {mean}."
 
 
 def _describe_script(contents: CardContents) -> Iterator[str]:

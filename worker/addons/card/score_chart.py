@@ -18,12 +18,13 @@ def draw_scores(report: EvaluationReport, name: str) -> bytes:
     found, word = report.results, score_word(report.world)
     figure = Figure(figsize=(8, 3.6), dpi=120, layout="constrained")
     points, counts = figure.subplots(1, 2, sharey=True, width_ratios=(4, 1))
-    points.plot(found.seeds, found.scores, "o", color=COLOUR, markersize=4, alpha=0.7)
-    counts.hist(found.scores, bins=20, orientation="horizontal", color=COLOUR, alpha=0.7)
+    scores, middle = [*map(found.shown, found.scores)], found.shown(found.mean)
+    points.plot(found.seeds, scores, "o", color=COLOUR, markersize=4, alpha=0.7)
+    counts.hist(scores, bins=20, orientation="horizontal", color=COLOUR, alpha=0.7)
     error = found.error or 0.0
     for axes in (points, counts):
-        axes.axhspan(found.mean - error, found.mean + error, color=MEAN, alpha=0.25, linewidth=0)
-        mean = axes.axhline(found.mean, color=MEAN, linewidth=1, label="mean and its standard error")
+        axes.axhspan(middle - error, middle + error, color=MEAN, alpha=0.25, linewidth=0)
+        mean = axes.axhline(middle, color=MEAN, linewidth=1, label="mean and its standard error")
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", alpha=0.3)
     lines = [mean]
@@ -33,10 +34,12 @@ def draw_scores(report: EvaluationReport, name: str) -> bytes:
     points.ticklabel_format(useOffset=False)
     for axes in (points, counts):
         axes.xaxis.set_major_locator(MaxNLocator(nbins="auto", integer=True))
-    points.set(xlabel=f"seed of the {word}" if word != "seed" else "seed", ylabel="score")
+    points.set(
+        xlabel=f"seed of the {word}" if word != "seed" else "seed", ylabel="value" if found.minimised else "score"
+    )
     counts.set(xlabel=f"{word}s")
     figure.legend(handles=lines, loc="outside lower right", ncols=2, frameon=False, fontsize=9)
-    mean_text = format_with_error(found.mean, found.error)
+    mean_text = format_with_error(middle, found.error)
     title = f"{name}: {mean_text} (standard error) on {plural(len(found.drives), word)}"
     figure.suptitle(title, fontsize=11, x=0.01, ha="left", parse_math=False)
     buffer = io.BytesIO()

@@ -16,6 +16,7 @@ from dreamfleet.common.host.resource_limits import pin_thread_pools
 from dreamfleet.common.host.stall_watch import STALL_SECONDS
 from dreamfleet.common.host.unseen_drawing import draw_offscreen, draw_unseen
 from dreamfleet.common.printable import plural
+from dreamfleet.common.protocol.function_values import minimises
 from dreamfleet.common.protocol.result_bounds import rejection_reason
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
@@ -95,20 +96,21 @@ def judge(
     `name` is the agent's in the report. `StoppedError` for a Ctrl-C once an episode has a score: it says the mean of
     those that have.
     """
-    began, episodes, scores = perf_counter(), list[Episode](), list[float]()
+    began, episodes, values = perf_counter(), list[Episode](), list[float]()
+    minimised = minimises(agent.task, agent.options)
     with progress_bar("evaluate", len(seeds), "episodes") as bar:
         try:
             for each in evaluate_in_processes(agent, seeds, jobs):
                 episodes.append(each)
-                scores += [each.score] if isinstance(each, EpisodeResult) else []
-                bar.update(len(episodes), f"mean {format_with_error(fmean(scores), None)}" if scores else "")
+                values += [0.0 - each.score if minimised else each.score] if isinstance(each, EpisodeResult) else []
+                bar.update(len(episodes), f"mean {format_with_error(fmean(values), None)}" if values else "")
                 if isinstance(each, FailedEpisode):
                     note(f"an episode failed: {each}")
         except KeyboardInterrupt:
-            if not scores:
+            if not values:
                 raise
-            mean = format_with_error(fmean(scores), standard_error(scores))
-            raise StoppedError(f"interrupted after {len(scores)} of {plural(len(seeds), 'episode')}: {mean}") from None
+            mean = format_with_error(fmean(values), standard_error(values))
+            raise StoppedError(f"interrupted after {len(values)} of {plural(len(seeds), 'episode')}: {mean}") from None
     results, world = EpisodeResults.of(episodes), agent.world
     return EvaluationReport(
         name, agent.sha256, agent.task, agent.reality, agent.bundle.sha256 if agent.bundle else "",

@@ -14,6 +14,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import read_text
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.printable import format_number, one_line, truncate
+from dreamfleet.common.protocol.function_values import minimises
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.runs.standard_error import format_with_error, score_digits
@@ -53,7 +54,7 @@ class EvaluationReport:
     @cached_property
     def results(self) -> EpisodeResults:
         """The episodes with their statistics."""
-        return EpisodeResults(self.drives, self.failed)
+        return EpisodeResults(self.drives, self.failed, minimises(self.task, self.options))
 
     def to_json(self) -> str:
         """One line of JSON: the statistics, then all fields; a statistic that is unknown is null."""
@@ -99,14 +100,13 @@ class EvaluationReport:
 
     def _describe_score(self, word: str) -> str:
         found = self.results
-        score = format_with_error(found.mean, found.error)
+        score = format_with_error(found.shown(found.mean), found.error)
         judged = "in gymnasium's environment" if self.judge == GYMNASIUM else f"in {one_line(self.judge)}"
         if found.std is None:
             return f"{score} on one {word}; judged {judged}"
         digits = score_digits(found.mean, found.error)
-        worst, best, median, std = (
-            format_with_error(each, None, digits) for each in (found.worst, found.best, found.median, found.std)
-        )
+        figures = (*map(found.shown, (found.worst, found.best, found.median)), found.std)
+        worst, best, median, std = (format_with_error(each, None, digits) for each in figures)
         return (
             f"{score} (standard error) on {len(found.drives)} {word}s, {worst} to {best}, median {median}, standard "
             f"deviation {std}; judged {judged}"

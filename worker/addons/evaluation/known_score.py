@@ -6,6 +6,7 @@ from typing import Any
 
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.printable import plural
+from dreamfleet.common.protocol.function_values import minimises
 from dreamfleet.common.runs.seeds import TEST
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.shipped import WORLDS
@@ -13,7 +14,10 @@ from dreamfleet.common.worlds.shipped import WORLDS
 
 @dataclass(frozen=True)
 class KnownScore:
-    """A mean score over `episodes` episodes, its standard error, and the seed of their median, if that is known."""
+    """A mean score over `episodes` episodes, its standard error, and the seed of their median, if that is known.
+
+    Of a minimised function the mean is its value.
+    """
 
     mean: float
     error: float | None
@@ -54,7 +58,8 @@ def find_known_score(controller: Controller) -> KnownScore | None:
     mean, error, episodes = (facts.get(f"validation_{name}") for name in ("mean", "error", "episodes"))
     if (number := _number(mean)) is None or type(episodes) is not int or episodes < 1:
         return None  # a file may say anything
-    return KnownScore(number, _number(error), episodes)
+    mean = 0.0 - number if minimises(controller.task, controller.options) else number
+    return KnownScore(mean, _number(error), episodes)
 
 
 def _number(value: Any) -> float | None:

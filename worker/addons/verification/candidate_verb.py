@@ -5,6 +5,7 @@ import json
 import math
 import re
 import sys
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.errors import JournalError, UsageError
 from dreamfleet.common.printable import one_line, plural
 from dreamfleet.common.protocol.failures import Failure
+from dreamfleet.common.protocol.function_values import value_of
+from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.worker.addons.verification.replay import ReplayedEpisode, replay
 from dreamfleet.worker.service.config import WorkerConfig
@@ -41,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     with open_run(args.runs_dir, args.run_name) as stored:
         device = load(WorkerConfig, "worker", **args.sources).torch_device
         episodes = list(replay(stored, int(found[1]), int(found[2]), torch_device=device))
-        stored_fitness = stored.fitness(int(found[1]), int(found[2]))
+        stored_fitness, spec = stored.fitness(int(found[1]), int(found[2])), stored.spec
     if not episodes:
         raise JournalError(f"candidate {args.candidate} of run {args.run_name} has no results yet")
     agree = [each.agrees(args.tolerance) for each in episodes]
@@ -55,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
                           "episodes": rows}))  # fmt: skip
     else:
         for each in episodes:
-            print(f"episode {each.episode}  seed {each.seed}  {_describe(each, args.tolerance)}")
+            print(f"episode {each.episode}  seed {each.seed}  {_describe(_in_values(each, spec), args.tolerance)}")
     count = plural(len(episodes), "episode")
     if varying := sum(not each.deterministic for each in episodes):
         print(f"{varying} of {count} {'was' if varying == 1 else 'were'} driven in an environment that is not "
@@ -68,6 +71,11 @@ def run(args: argparse.Namespace) -> int:
         print(f"{unchecked} of {count} {'was' if unchecked == 1 else 'were'} scored by hosts of another class, which "
               "this host cannot check bit by bit; --tolerance N compares them", file=sys.stderr)  # fmt: skip
     return 0 if False not in agree and True in agree else 1
+
+
+def _in_values(each: ReplayedEpisode, task: TaskSpec) -> ReplayedEpisode:
+    stored, replayed = (None if found is None else value_of(found, task) for found in (each.stored, each.replayed))
+    return replace(each, stored=stored, replayed=replayed)
 
 
 def _text(failure: Failure | None) -> str:

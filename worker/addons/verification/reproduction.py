@@ -56,6 +56,10 @@ class Reproduction:
         return PairedDifference.between(self._compared, self.repeated.results)
 
     @property
+    def _difference_text(self) -> str:
+        return self.difference.describe(minimised=self.repeated.results.minimised)
+
+    @property
     def _compared(self) -> EpisodeResults:
         return EpisodeResults(tuple(one for one, _ in self.pairs))
 
@@ -89,7 +93,8 @@ class Reproduction:
     @property
     def description(self) -> str:
         """A text for display."""
-        name, count, mean = self.recorded.name, len(self.pairs), self.repeated.results.mean
+        results = self.repeated.results
+        name, count, mean = self.recorded.name, len(self.pairs), results.shown(results.mean)
         failed = len(self.recorded.failed)
         if self.differing_facts:
             first = self.differing_facts[0]
@@ -112,13 +117,13 @@ class Reproduction:
             )
         hosts = f"recorded on [{self.recorded.fingerprint}], this host is [{self.repeated.fingerprint}]"
         if count < 2:
-            was = f"{format_number(mean)} instead of {format_number(self.pairs[0][0].score)}"
+            was = f"{format_number(mean)} instead of {format_number(results.shown(self.pairs[0][0].score))}"
             return f"{name}: NOT reproduced: {was} on one seed; without equal bits a comparison takes 2 seeds; {hosts}"
         if not self.is_decided:
-            said = f"mean {format_number(mean)}, {self.difference.description}"
+            said = f"mean {format_number(mean)}, {self._difference_text}"
             return f"{name}: not decided: {said}; compare more seeds; {hosts}"
         verdict = "reproduced" if self.is_reproduced else "NOT reproduced"
-        return f"{name}: {verdict}: mean {format_number(mean)}, {self.difference.description}; {hosts}"
+        return f"{name}: {verdict}: mean {format_number(mean)}, {self._difference_text}; {hosts}"
 
 
 def _contradicts(recorded: object, repeated: object) -> bool:

@@ -5,18 +5,26 @@ import json
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from dreamfleet.common.addons.analysis.comparison import ComparedRun, are_comparable
 from dreamfleet.common.addons.analysis.learning import LearningCurve
+from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.protocol.function_values import value_of
+from dreamfleet.common.runs.episode_results import EpisodeResult
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration, in_values
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.addons.dashboard.compared_runs import compare_runs
 from dreamfleet.coordinator.addons.dashboard.stored_runs import describe_run, list_runs
 from dreamfleet.coordinator.addons.runs.plot import fitness_figure, learning_figure
 from dreamfleet.coordinator.addons.status.status_panel import panel_lines
+from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
+from dreamfleet.worker.addons.evaluation.known_score import find_known_score
+from dreamfleet.worker.addons.verification.candidate_verb import _in_values
+from dreamfleet.worker.addons.verification.replay import ReplayedEpisode
+from dreamfleet.worker.addons.verification.reproduction import Reproduction
 from tests.support.journals import change_journal, change_settings
 from tests.support.processes import printed
 from tests.support.samples import SPEC, STATUS
@@ -96,3 +104,39 @@ def test_the_panel_says_values():
     text = " ".join(" ".join(line.plain for line in panel_lines(status, 78)).split())
     assert re.search(r"\b1\.0.*2,000.*0\.5.*0.*3", text)
     assert "-2,000" not in text
+
+
+MAXIMISED = Objective.of({"dimension": 39, "x0": 0}).options
+REPORT = EvaluationReport(
+    "a1", "cd" * 32, MINIMISED.task, MINIMISED.task, "", "x86_64", "0.1.0", 1.0,
+    tuple(EpisodeResult(seed, score, 1) for seed, score in ((1, -2.0), (2, -4.0))), judge="mine", options=OPTIONS,
+)  # fmt: skip
+
+
+def numbers(text):
+    return [float(each) for each in re.findall(r"-?\b\d+\.\d+", text)]
+
+
+@pytest.mark.parametrize("shown", [3.0, -3.0])
+def test_texts_of_an_evaluation_show_values_and_its_figures_are_fitness(tmp_path, shown):
+    report = REPORT if shown > 0 else replace(REPORT, options=MAXIMISED)
+    assert (report.results.mean, report.results.worst, report.results.best) == (-3.0, -4.0, -2.0)
+    assert json.loads(report.to_json())["mean"] == -3.0
+    texts = repr(report.results), report.describe(), Reproduction(report, report).description
+    assert [numbers(each)[0] for each in texts] == [shown] * 3
+    costlier = replace(report, drives=tuple(replace(each, score=each.score - each.seed) for each in report.drives))
+    paths = tmp_path / "one.json", tmp_path / "other.json"
+    for path, each in zip(paths, (report, costlier), strict=True):
+        path.write_text(each.to_json())
+    *_, difference = printed("compare", *paths).splitlines()
+    assert numbers(difference)[0] == (1.5 if shown > 0 else -1.5)
+
+
+@pytest.mark.parametrize("shown", [3.0, -3.0])
+def test_a_controllers_known_score_and_a_replayed_candidate_are_values(shown):
+    options = OPTIONS if shown > 0 else MAXIMISED
+    provenance = {"validation_mean": -3.0, "validation_error": 0.5, "validation_episodes": 2}
+    controller = Controller(ControllerShape(1, 1), np.ones(2, np.float32), MINIMISED.task, "", provenance, options)
+    assert find_known_score(controller).mean == shown
+    found = _in_values(ReplayedEpisode(0, 1, -3.0, -3.0, "", own=True), replace(MINIMISED, options=options))
+    assert (found.stored, found.replayed, found.same) == (shown, shown, True)
