@@ -1,5 +1,6 @@
 """Which hosts may add to a run: those that know its task and, if the run is strict, compute like its first host."""
 
+from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.protocol.host_classes import effective_class
 from dreamfleet.common.protocol.messages import HelloRequest
 from dreamfleet.common.runs.records import RunSettings
@@ -13,7 +14,6 @@ from dreamfleet.coordinator.storage.journal import FINGERPRINT, HOST_CLASS, Jour
 from dreamfleet.coordinator.storage.verification_records import StoredBar
 
 BARRED_REMEDY = "test its memory and its installation; then start its worker with another --name"
-OPERATOR_REMEDY = "ask the run's operator, who can let it in again with `dreamfleet bar HOST --no-longer`"
 
 
 class WorkerAdmission:
@@ -37,8 +37,10 @@ class WorkerAdmission:
         settings = self._settings
         admitted = self.host_class if self.strict else None
         found = find_refusal(request, settings.task.task, admitted, settings.packages)
-        if (bar := self.barred.get(host_of(request.worker))) is not None:
-            remedy = OPERATOR_REMEDY if bar.by_operator else BARRED_REMEDY
+        if (bar := self.barred.get(host := host_of(request.worker))) is not None:
+            again = shell_command("bar", host, self._journal.path.parent.name, "--no-longer")
+            operator = f"ask the run's operator, who can let it in again with `{again}`"
+            remedy = operator if bar.by_operator else BARRED_REMEDY
             found = Refusal(f"it is barred from this run: {bar.why}", remedy)
         final = request.packages == settings.packages  # otherwise the worker says hello again with these packages
         if found is not None and final and self.refused_workers.add(request.worker, found.why):

@@ -248,7 +248,7 @@ class Demo:
             with Live(console=self._console, refresh_per_second=4) as live:
 
                 def look() -> None:
-                    run.check_some_worker()
+                    run.check_workers()
                     self._show(live, client, demo_run.run)
 
                 run.wait(never_stop, look, REFRESH)

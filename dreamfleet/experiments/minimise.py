@@ -329,9 +329,13 @@ class _Searches:
         return StopReason(run.stop_kind, run.ended or run.state)
 
     def _follow_rest(self, run: StartedRun, objective: Objective) -> None:
-        """Note what closed since the last report, so that all numbers are of one moment; the callback is not called."""
+        """Note what closed since the last report, so that all numbers are of one moment; the callback is not called.
+
+        What a recall took back and nothing replaced is forgotten.
+        """
         for generation in run.new_generations():
             self._follow(run, objective, generation)
+        self._forget_from(self._first + len(run.history()))
 
     def _objective_of(self, plan: _Plan, number: int) -> Objective:
         """Where a search begins: the first at x0, a restart at random within bounds, or at x0 if there are none."""
@@ -349,10 +353,7 @@ class _Searches:
 
     def _follow(self, run: StartedRun, objective: Objective, generation: StoredGeneration) -> Progress:
         """Note a closed generation; one that closes again after a recall replaces itself and those after it."""
-        index = self._first + generation.number
-        if index < len(self._history):
-            self._calls, self._best, self._failed = self._before[index]
-            del self._history[index:], self._before[index:]
+        self._forget_from(self._first + generation.number)
         self._before.append((self._calls, self._best, self._failed))
         self._calls += generation.steps
         self._note_failures(run, generation.failed)
@@ -369,6 +370,12 @@ class _Searches:
         )  # fmt: skip
         self._history.append(progress)
         return progress
+
+    def _forget_from(self, index: int) -> None:
+        """Drop the noted generations from this one on, with what was counted and found in them."""
+        if index < len(self._history):
+            self._calls, self._best, self._failed = self._before[index]
+            del self._history[index:], self._before[index:]
 
     def _note_failures(self, run: StartedRun, failed: int) -> None:
         """Count failed candidates, and warn of the first one."""

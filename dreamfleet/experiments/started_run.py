@@ -101,7 +101,8 @@ class StartedRun(StoredRun):
         """Each generation as soon as it is closed, until the run ends or is ended.
 
         After a recall (`dreamfleet bar`) numbers go back: what closes again comes again, in place of what came before.
-        `DreamfleetError` if a process fails or the run pauses by itself, `StoppedError` if somebody else stops it.
+        `DreamfleetError` if the coordinator or every worker fails or the run pauses by itself, `StoppedError` if
+        somebody else stops it.
         """
         while True:
             over = self._processes.coordinator.exit_code is not None

@@ -1,6 +1,7 @@
 """Searching a function's minimum on processes of this host. Tests dreamfleet/experiments/local/search_arguments.py."""
 
 import re
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import dreamfleet
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.protocol.stop_kind import StopKind
+from dreamfleet.coordinator.run.recall import bar_stored
 from dreamfleet.experiments import minimise as module
 from dreamfleet.experiments.local.search_arguments import read_bounds, read_objective
 from tests.support import lying_tasks, objectives
@@ -129,6 +131,24 @@ def test_what_a_barred_host_brought_is_in_no_result(processes, tmp_path):
     with dreamfleet.open_run("mine", tmp_path) as run:
         assert [each.mean for each in found.history] == [-each.mean for each in run.history()]
         assert found.history[-1].fun == -max(each.best for each in run.history())
+
+
+@pytest.mark.slow
+def test_what_is_recalled_after_the_end_is_in_no_result(tmp_path):
+    def bar(progress):
+        def is_barred():
+            with suppress(UsageError):  # while it is served
+                bar_stored(tmp_path / progress.run, "core-0", is_barred=True)
+                return True
+            return False
+
+        if progress.generation == 0:
+            with dreamfleet.open_run(progress.run, tmp_path) as run:
+                until(lambda: run.ended is not None, "the run ends")
+            until(is_barred, "the only host is barred")
+
+    with pytest.raises(UsageError, match="first generation"):
+        dreamfleet.minimise(objectives.sphere, [0, 0], 1.0, generations=3, callback=bar, runs_dir=tmp_path, **FEW)
 
 
 @pytest.mark.slow

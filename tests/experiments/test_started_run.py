@@ -134,6 +134,16 @@ def test_a_worker_that_dies_is_named_and_so_is_a_stop_from_elsewhere(alive, tmp_
     assert not alive()
 
 
+@pytest.mark.slow
+def test_a_run_goes_on_while_one_of_its_own_workers_may_score(tmp_path):
+    with start_run(run="pole", runs_dir=tmp_path, **{**SMALL, "workers": 2, "generations": 10**6}) as run:
+        run.client.control("pole", "bar", "core-1")
+        assert run._processes._workers[1].popen.wait(DEADLINE)
+        assert "bar core-1 pole --no-longer" in run._processes._workers[1].last_line()
+        closed = len(run.history())
+        assert any(each.number > closed for each in run)
+
+
 class Leaving:
     """The processes of a run that has ended: the coordinator exits, and its worker did not do so in time."""
 

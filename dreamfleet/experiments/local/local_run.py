@@ -122,12 +122,6 @@ class LocalRun:
             return self._stack.enter_context(process)
 
     def check_workers(self) -> None:
-        """`DreamfleetError` if a worker failed."""
-        for each in self._workers:
-            if each.exit_code not in (None, 0):
-                raise DreamfleetError(f"this host's worker failed: {each.last_line()}")
-
-    def check_some_worker(self) -> None:
         """`DreamfleetError` if every worker failed: the coordinator would wait for ever."""
         if self._workers and all(each.exit_code not in (None, 0) for each in self._workers):
             raise DreamfleetError(f"this host's workers failed: {self._workers[-1].last_line()}")

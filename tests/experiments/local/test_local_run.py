@@ -41,12 +41,12 @@ def test_a_run_whose_workers_all_failed_is_not_waited_for(tmp_path):
     words = ("coordinator", "--run", "alone", "--runs-dir", tmp_path, "--task", "gym:CartPole-v1", "--generations", 1)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with LocalRun("alone", (*words, "--listen", endpoint), tmp_path) as run:
-        run.check_some_worker()
+        run.check_workers()
         run.start_worker("fails", ("worker", "--connect", endpoint, "--slots", "none"))
         run.start_worker("lives", ("worker", "--connect", endpoint, "--run", "another"))
         first, second = (each.popen for each in run._workers)
         assert first.wait(DEADLINE)
-        run.check_some_worker()  # the other one may go on
+        run.check_workers()  # the other one may go on
         second.kill()
         with pytest.raises(DreamfleetError, match=r"\b9\b"):
-            run.wait(never_stop, run.check_some_worker)
+            run.wait(never_stop, run.check_workers)
