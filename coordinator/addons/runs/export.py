@@ -42,12 +42,17 @@ def export_csv(run: RunFolder, folder: Path) -> list[Path]:
     def save(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> None:
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, columns)
-        writer.writeheader()
+        writer.writerow({name: _as_cell(name) for name in columns})  # what lies below are numbers
         writer.writerows(rows)
         with open_output(path) as file:
             file.write(text.getvalue().encode())
 
     return _export_tables(run, folder, "csv", save)
+
+
+def _as_cell(name: str) -> str:
+    """The name as a cell that no spreadsheet takes for a formula."""
+    return f"'{name}" if name.startswith(("=", "+", "-", "@")) else name
 
 
 def export_parquet(run: RunFolder, folder: Path) -> list[Path]:

@@ -9,6 +9,7 @@ from typing import Any, Final
 import matplotlib as mpl
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.legend import Legend
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from dreamfleet.common.addons.analysis.elites import RunArchive, exploration_note
@@ -153,7 +154,7 @@ def learning_figure(curves: Sequence[LearningCurve], marks: PublishedScores | No
         axes.grid(alpha=0.3, which="major")
     where = f" in {curves[0].world}" if one_world else ""
     title = f"evaluated score{where} over what the search spent: {', '.join(each.name for each in curves)}"
-    figure.suptitle("\n".join(textwrap.wrap(title, TITLE)), fontsize=11, x=0.01, ha="left")
+    figure.suptitle("\n".join(textwrap.wrap(title, TITLE)), fontsize=11, x=0.01, ha="left", parse_math=False)
     _add_legend(figure, over_steps.get_legend_handles_labels()[0])
     return figure
 
@@ -219,7 +220,8 @@ def _draw_marks(axes: Any, marks: Sequence[tuple[float, float]], source: str) ->
 def _set_titles(axes: Any, title: str, note: str) -> None:
     """Write a title from the left edge, and under it a note in grey."""
     lines = textwrap.wrap(note, TITLE)
-    axes.set_title("\n".join(textwrap.wrap(title, TITLE)), fontsize=11, loc="left", pad=6 + LINE * len(lines))
+    wrapped = "\n".join(textwrap.wrap(title, TITLE))
+    axes.set_title(wrapped, fontsize=11, loc="left", pad=6 + LINE * len(lines), parse_math=False)
     place = {"xycoords": "axes fraction", "xytext": (0, 6), "textcoords": "offset points"}
     axes.annotate("\n".join(lines), (0, 1), **place, fontsize=9, color="dimgray", annotation_clip=False)
 
@@ -230,9 +232,16 @@ def _add_legend(figure: Figure, handles: Sequence[Any], columns: int = 1) -> Non
         legend = figure.legend(
             handles=handles, loc=LEGEND_PLACE, ncols=count, fontsize=9, frameon=False, borderaxespad=1
         )
+        show_as_is(legend)
         if count == 1 or legend.get_window_extent().width < figure.bbox.width:
             return
         legend.remove()
+
+
+def show_as_is(legend: Legend) -> None:
+    """Have a legend's names stand as they are: a pair of `$` in them is no formula."""
+    for each in legend.get_texts():
+        each.set_parse_math(False)
 
 
 def _score_axis(curves: Sequence[LearningCurve], scale: str) -> str:

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from dreamfleet.experiments.sweep.runner import RunProgress
 
@@ -56,7 +57,7 @@ def _table(progress: Sequence[RunProgress]) -> Table:
     ranks = {"running": 0, "failed": 1, "left open": 1, "finished": 2, "waiting": 3}
     shown = sorted(progress, key=lambda each: ranks[each.state])[:MOST_ROWS]
     for each in shown:
-        table.add_row(each.run.name, each.state, each.text)
+        table.add_row(*map(Text, (each.run.name, each.state, each.text)))  # names are no markup
     if len(progress) > len(shown):
         table.add_row("...", f"{len(progress) - len(shown)} more", "")
     return table

@@ -10,7 +10,7 @@ from dreamfleet.common.addons.analysis.fitness_chart import PLOT_COLOURS
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.function_values import is_minimised, spans_decades
 from dreamfleet.common.protocol.tasks import is_function_task
-from dreamfleet.coordinator.addons.runs.plot import save_figure
+from dreamfleet.coordinator.addons.runs.plot import save_figure, show_as_is
 from dreamfleet.experiments.sweep.summary import RunResult, mean_curve, with_goal, word_of
 
 FEWEST = 3  # evaluations of a run that make a curve
@@ -62,5 +62,5 @@ def sweep_figure(results: Sequence[RunResult]) -> Any:
         kind += ", log scale"
     axes.set_ylabel(with_goal(kind, results))
     axes.grid(alpha=0.3)
-    figure.legend(loc=LEGEND_PLACE, ncols=2, fontsize=9, frameon=False)
+    show_as_is(figure.legend(loc=LEGEND_PLACE, ncols=2, fontsize=9, frameon=False))
     return figure

@@ -96,7 +96,7 @@ def picture_grid(rows: Sequence[tuple[str, Pictures]], columns: Sequence[str]) -
             each.spines[:].set_visible(False)
         line[0].set_ylabel(label, rotation=0, ha="right", va="center", fontsize=FONT + 1)
     for each, heading in zip(axes[0], columns, strict=True):
-        each.set_title(heading, fontsize=FONT + 1)
+        each.set_title(heading, fontsize=FONT + 1, parse_math=False)  # it may be the name of a file
     return render_png(figure)
 
 

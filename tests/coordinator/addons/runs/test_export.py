@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 from pyarrow import parquet
@@ -22,7 +23,7 @@ from dreamfleet.experiments.verbs.compare import SAME_SEEDS
 from tests.support.disks import small_disk
 from tests.support.events import scalars
 from tests.support.failing_runs import SETTINGS, finished
-from tests.support.journals import change_journal, confirm
+from tests.support.journals import change_journal, change_settings, confirm
 from tests.support.processes import DEADLINE, call_here, printed
 from tests.support.tables import cells
 
@@ -69,6 +70,17 @@ def test_a_generation_without_a_fitness_has_none_in_any_export(runs, tmp_path, m
     assert [parquet.read_table(tmp_path / "generations.parquet").to_pylist()[1][name] for name in fitness] == [None] * 4
     assert 1 not in dict(drawn["fitness/best"])
     assert 1 in dict(drawn["search/sigma"])
+
+
+def test_the_name_of_a_measure_is_no_formula_in_a_spreadsheet(runs, tmp_path):
+    change_settings(runs / "reality", lambda settings: replace(settings, archive=("@SUM(1+1)=0:1:2",)))
+    change_journal(runs / "reality", "UPDATE candidate SET measures = '[0.5]'")
+    with RunFolder(runs / "reality") as run:
+        export_csv(run, tmp_path)
+    with (tmp_path / "elites.csv").open(newline="") as file:
+        names, first, *_ = csv.reader(file)
+    assert names == ["cell.@SUM(1+1)", "'@SUM(1+1)", "fitness", "generation", "candidate"]
+    assert float(first[1]) == 0.5
 
 
 @pytest.mark.parametrize("name", ["elites.csv", "elites.npz"])

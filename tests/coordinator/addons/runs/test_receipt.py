@@ -134,6 +134,15 @@ def test_what_a_strangers_controller_says_is_no_markup(reality):
     assert parts <= {"text", "text_special", "code_inline"}
 
 
+def test_a_dollar_sign_in_a_tasks_name_is_no_formula(reality, tmp_path):
+    def renamed(settings):
+        return replace(settings, task=replace(settings.task, task="gym:a$\\frac$-v0"))
+
+    change_settings(reality, renamed)
+    for kind in ("fitness", "learning"):
+        printed("runs", "plot", "reality", "--kind", kind, "--out", tmp_path / f"{kind}.png")
+
+
 @pytest.mark.slow
 def test_the_commands_of_a_run_in_an_environment_of_a_module_run_as_printed(processes):
     task, module = "gym:tests.support.dark_environments:Dark-v0", "tests.support.dark_environments"
