@@ -34,6 +34,7 @@ from dreamfleet.coordinator.addons.runs.stored_run import StoredRun
 from dreamfleet.coordinator.settings import run_setup
 from dreamfleet.experiments.local import command_lines
 from dreamfleet.experiments.local.function_names import environment_for
+from dreamfleet.experiments.local.kept_words import check_announced
 from dreamfleet.experiments.local.local_run import ALONE, POLL_INTERVAL, LocalFleet, LocalRun, has_begun, task_flags
 from dreamfleet.experiments.local.run_arguments import RunArguments
 
@@ -258,7 +259,9 @@ def start_run_in(
         run = StartedRun(folder / name, processes, address, client, resumed=bool(settings.get("resume")))
         needed = None
         if run.client is not None:  # the flags by which a worker of this run announces its tasks
-            needed = task_flags(run.spec.task, *((bundle.manifest.task,) if (bundle := run.bundle()) else ()))
+            modelled = (bundle.manifest.task,) if (bundle := run.bundle()) else ()
+            check_announced(each for each in modelled if each != run.spec.task)
+            needed = task_flags(run.spec.task, *modelled)
         if needed != expected:
             processes.end_workers()
             if needed is not None:

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 import psutil
 import pytest
 
+from dreamfleet.common.artifacts.bundle import MANIFEST
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
 from dreamfleet.coordinator.addons.runs.stored_run import open_run
@@ -25,6 +26,7 @@ from dreamfleet.experiments.started_run import (
     evolve,
     start_run,
 )
+from tests.support.bundles import rewrite
 from tests.support.processes import DEADLINE, ROOT, environment, until
 from tests.support.tasks import RAISING
 
@@ -222,3 +224,23 @@ def test_settings_are_the_flags_of_the_coordinator():
         *("--optimiser-options", "a=1", "b=2"),
         *("--normalise", "--no-racing", "--target=-5.5"),
     )
+
+
+@pytest.mark.slow
+def test_a_world_model_chooses_no_code_of_the_workers(alive, tmp_path, random_bundle):
+    path, task = tmp_path / "strangers.zip", random_bundle.manifest.task
+    path.write_bytes(random_bundle.path.read_bytes())
+    wanted = b'"gym:strangers_choice:Env-v0"'
+    rewrite(path, lambda name, data: data.replace(f'"{task}"'.encode(), wanted) if name == MANIFEST else data)
+    with pytest.raises(UsageError, match="--trust strangers_choice"):
+        start_run(
+            task="dream",
+            evaluate_every=0,
+            bundle=path,
+            population=3,
+            episodes=1,
+            generations=1,
+            workers=1,
+            runs_dir=tmp_path / "runs",
+        )
+    assert not alive()
