@@ -10,10 +10,12 @@ from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
 from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
 from dreamfleet.common.files.regular_files import read_regular
 from dreamfleet.common.host.stop_signals import Stop, never_stop
+from dreamfleet.common.printable import one_line
 from dreamfleet.common.runs.episode_results import EpisodeResult
 from dreamfleet.worker.addons.card import card_page
 from dreamfleet.worker.addons.evaluation.agents import Agent, make_agent, make_evaluation_spec
-from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
+from dreamfleet.worker.addons.evaluation.evaluation import facts_of
+from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport, differing_facts
 from dreamfleet.worker.addons.evaluation.known_score import first_seed
 from dreamfleet.worker.addons.recording.verb import MOST_STEPS
 from dreamfleet.worker.tasks.api import Assignment
@@ -27,13 +29,11 @@ def write_card(
     """Write the folder with a video of `steps` at most, 0: none; return the names of its files.
 
     What the controller or this host cannot give is left out, and `contents.missing` says why. `UsageError` for a folder
-    in use, or a report of another controller; `StoppedError` if `stop()` turned true while the video was made.
+    in use, or a report of another controller or world; `StoppedError` if `stop()` turned true while the video was made.
     """
     controller, report = contents.controller, contents.report
-    if report is not None and report.controller != controller.sha256:
-        raise UsageError(
-            f"the report is of the controller {report.controller[:12]}, and this is {controller.sha256[:12]}"
-        )
+    if report is not None:
+        _check_report(report, contents)
     with reporting_unwritable_folder(folder, "choose another --out"):
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
@@ -53,6 +53,18 @@ def write_card(
         files = sorted(each.name for each in folder.iterdir())
         (folder / card_page.PAGE).write_text("\n".join(card_page.describe_card(contents, files)) + "\n")
     return sorted(each.name for each in folder.iterdir())
+
+
+def _check_report(report: EvaluationReport, contents: card_page.CardContents) -> None:
+    controller = contents.controller
+    if report.controller != controller.sha256:
+        raise UsageError(
+            f"the report is of the controller {report.controller[:12]}, and this is {controller.sha256[:12]}"
+        )
+    now = facts_of(make_agent(controller, contents.bundle))
+    for name in differing_facts(report, now):
+        was, found = (one_line(str(each[name])) or "none" for each in (report.facts, now))
+        raise UsageError(f"the report says {name} {was}, and it is {found}: write another with `dreamfleet evaluate`")
 
 
 def _try(contents: card_page.CardContents, name: str, write: Callable[[], None]) -> None:

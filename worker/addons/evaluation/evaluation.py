@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from statistics import fmean
 from time import perf_counter
+from typing import Any
 
 from dreamfleet.common.cli.progress import progress_bar
 from dreamfleet.common.errors import DreamfleetError, StoppedError
@@ -111,13 +112,21 @@ def judge(
                 raise
             mean = format_with_error(fmean(values), standard_error(values))
             raise StoppedError(f"interrupted after {len(values)} of {plural(len(seeds), 'episode')}: {mean}") from None
-    results, world = EpisodeResults.of(episodes), agent.world
+    results = EpisodeResults.of(episodes)
     return EvaluationReport(
-        name, agent.sha256, agent.task, agent.reality, agent.bundle.sha256 if agent.bundle else "",
-        fingerprint(world.packages), package_version("dreamfleet") or "", perf_counter() - began,
-        results.drives, judge=world.judge or agent.reality, threshold=world.threshold, failed=results.failed,
-        marks=tuple(map(float, world.marks)), options=agent.options,
+        name=name, fingerprint=fingerprint(agent.world.packages), version=package_version("dreamfleet") or "",
+        seconds=perf_counter() - began, drives=results.drives, failed=results.failed, **facts_of(agent),
     )  # fmt: skip
+
+
+def facts_of(agent: Agent) -> dict[str, Any]:
+    """A report's facts of an agent and its world, which is what a report of it must state."""
+    world = agent.world
+    return {
+        "controller": agent.sha256, "task": agent.task, "options": agent.options, "world": agent.reality,
+        "judge": world.judge or agent.reality, "bundle": agent.bundle.sha256 if agent.bundle else "",
+        "threshold": world.threshold, "marks": tuple(map(float, world.marks)),
+    }  # fmt: skip
 
 
 class AgentEvaluator:

@@ -21,6 +21,7 @@ from dreamfleet.common.runs.standard_error import format_with_error, score_digit
 from dreamfleet.common.schema.validation import OPTIONAL, MalformedError, Seconds, from_plain_lenient
 
 GYMNASIUM = "gymnasium"  # the judge of worlds that gymnasium itself has
+FACTS = "controller", "task", "options", "world", "judge", "bundle", "threshold", "marks"  # what was driven
 MAX_MARKS = 8
 MIN_EPISODES_TO_SOLVE = 100  # customary number of episodes for gymnasium's threshold of solving an environment
 MAX_BYTES, MAX_EPISODES, MAX_SEED = 64 << 20, 10**5, 2**63
@@ -59,6 +60,11 @@ class EvaluationReport:
     def to_json(self) -> str:
         """One line of JSON: the statistics, then all fields; a statistic that is unknown is null."""
         return json.dumps({**self.figures, **asdict(self)}, allow_nan=False)
+
+    @property
+    def facts(self) -> dict[str, object]:
+        """What was driven, by the names of the fields."""
+        return {name: getattr(self, name) for name in FACTS}
 
     @property
     def figures(self) -> dict[str, object]:
@@ -116,6 +122,16 @@ class EvaluationReport:
         model = f", world model {self.bundle[:12]}" if self.bundle else ""
         made = f"{self.results.steps:,} environment steps in {self.seconds:.0f} s"
         return f"{made}; controller {self.controller[:12]}{model}; dreamfleet {one_line(self.version)}"
+
+
+def contradicts(recorded: object, now: object) -> bool:
+    """Whether a figure or fact of a record is another one now; it states nothing where it is empty."""
+    return recorded not in (None, "", ()) and recorded != now
+
+
+def differing_facts(recorded: EvaluationReport, now: Mapping[str, object]) -> tuple[str, ...]:
+    """The facts that the record states, and that are others now."""
+    return tuple(name for name, was in recorded.facts.items() if contradicts(was, now[name]))
 
 
 def read_evaluation_report(path: Path) -> EvaluationReport:

@@ -7,9 +7,7 @@ from itertools import starmap
 from dreamfleet.common.printable import format_number, one_line, plural
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
 from dreamfleet.common.runs.paired_difference import PairedDifference
-from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
-
-WHAT = "controller", "task", "options", "world", "judge", "bundle", "threshold", "marks"  # of a report: what was driven
+from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport, contradicts, differing_facts
 
 
 @dataclass(frozen=True)
@@ -37,16 +35,15 @@ class Reproduction:
 
     @property
     def differing_facts(self) -> tuple[str, ...]:
-        """The fields of `WHAT` that the record states, and that are others now."""
-        was, now = ([getattr(each, name) for name in WHAT] for each in (self.recorded, self.repeated))
-        return tuple(name for name, one, other in zip(WHAT, was, now, strict=True) if _contradicts(one, other))
+        """What the record states of controller and world, and what is another now."""
+        return differing_facts(self.recorded, self.repeated.facts)
 
     @property
     def differing_seeds(self) -> tuple[int, ...]:
         """The seeds whose score, number of steps or another recorded figure differs, or which fail now."""
         differing = {
             one.seed for one, other in self.pairs
-            if any(starmap(_contradicts, zip(astuple(one), astuple(other), strict=True)))
+            if any(starmap(contradicts, zip(astuple(one), astuple(other), strict=True)))
         }  # fmt: skip
         return tuple(sorted(differing | {each.seed for each in self.repeated.failed}))
 
@@ -124,8 +121,3 @@ class Reproduction:
             return f"{name}: not decided: {said}; compare more seeds; {hosts}"
         verdict = "reproduced" if self.is_reproduced else "NOT reproduced"
         return f"{name}: {verdict}: mean {format_number(mean)}, {self._difference_text}; {hosts}"
-
-
-def _contradicts(recorded: object, repeated: object) -> bool:
-    """Whether a figure or fact of a record is another one now; it states nothing where it is empty."""
-    return recorded not in (None, "", ()) and recorded != repeated

@@ -24,9 +24,12 @@ from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.runs.lookup import find_bundle_of
 from dreamfleet.common.runs.standard_error import format_with_error
+from dreamfleet.worker.addons.card.card import write_card
 from dreamfleet.worker.addons.card.card_page import CardContents, describe_card
 from dreamfleet.worker.addons.card.driver_graph import export_driver, largest_difference
 from dreamfleet.worker.addons.card.score_chart import draw_scores
+from dreamfleet.worker.addons.evaluation.agents import make_agent
+from dreamfleet.worker.addons.evaluation.evaluation import judge
 from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
 from dreamfleet.worker.addons.evaluation.known_score import find_known_score
 from dreamfleet.worker.tasks.registry import find_task
@@ -132,6 +135,23 @@ def test_a_report_of_another_controller_and_a_folder_in_use_are_refused(tmp_path
     (tmp_path / "mine").write_text("")
     assert main(["card", "real", "--out", str(tmp_path)]) == 2
     assert "--out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("changes", [
+    {"world": "car-racing"}, {"options": '{"normalise": false}'}, {"judge": "dodge"}, {"threshold": 1.0},
+    {"marks": (1.0,)}, {"bundle": "ab" * 32}, {"task": "car-racing"},
+])  # fmt: skip
+def test_a_report_of_another_world_is_refused(tmp_path, changes):
+    described = find_task("gym:CartPole-v1").describe({"normalise": True})
+    shape = ControllerShape(described.observations, described.outputs)
+    parameters = np.zeros(shape.size, np.float32)
+    own = Controller(shape, parameters, "gym:CartPole-v1", "", {}, described.options, described.version)
+    report = judge("own", make_agent(own), (10_000,), 1)
+    out = tmp_path / "card"
+    with pytest.raises(UsageError, match=next(iter(changes))):
+        write_card(CardContents(own, None, replace(report, **changes), "own"), out, 0)
+    assert not out.exists()
+    assert "evaluation.json" in write_card(CardContents(own, None, report, "own"), out, 0)
 
 
 def test_an_imported_controller_has_a_card(tmp_path):
