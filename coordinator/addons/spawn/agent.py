@@ -131,6 +131,26 @@ class HostFolder:
         """A shell command that removes everything of ours."""
         return f"cd {shlex.quote(str(self.root))} && rm -rf {' '.join((*FOLDERS, CREATED, LOCK))}"
 
+    def check_mine(self) -> None:
+        """`FailedError` if other users may change what is ours, or put something of theirs there in its place.
+
+        A link of this user's may lead to the folder, but none inside it.
+        """
+        for path in (self.root, *(self.root / each for each in (*FOLDERS, CREATED, LOCK))):
+            with suppress(FileNotFoundError, NotADirectoryError):
+                link = path.lstat()
+                if stat.S_ISLNK(link.st_mode) and path != self.root:
+                    raise FailedError(f"{path} is a link: remove it, or name another --remote-dir")
+                found = path.stat()
+                if not {link.st_uid, found.st_uid} <= {os.geteuid(), 0}:
+                    raise FailedError(f"{path} is another user's: name another --remote-dir")
+                by_group = bool(found.st_mode & stat.S_IWGRP) and found.st_gid != os.geteuid()  # not a private group
+                if by_group or found.st_mode & stat.S_IWOTH:
+                    raise FailedError(
+                        f"others may write to {path}: name another --remote-dir, or if all there is yours: "
+                        f"chmod go-w {shlex.quote(str(path))}"
+                    )
+
     def environment(self, name: str) -> Path:
         """The folder of an environment."""
         return self.root / "environments" / name
@@ -172,6 +192,7 @@ class HostFolder:
                 with suppress(FileNotFoundError):
                     held = os.path.samestat(os.fstat(lock.fileno()), (self.root / LOCK).stat())
                 if held:
+                    self.check_mine()  # now that it exists, nobody else makes it
                     if creating:
                         self._record(made, ours)
                     self.lock = lock.fileno()
@@ -627,6 +648,7 @@ def handle_request(request: dict[str, Any], channel: Channel) -> None:
     where = request["root"]
     try:
         host_folder = HostFolder(where, channel)
+        host_folder.check_mine()
         channel.send("ok", ACTIONS[request["do"]](host_folder, request))
     except FailedError as error:
         channel.send("failed", str(error))

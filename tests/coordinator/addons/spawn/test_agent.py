@@ -67,6 +67,75 @@ def test_a_foreign_folder_is_left_alone(tmp_path, capsys, names):
     assert all(path.exists() for path in kept)
 
 
+def give_away(path):
+    try:
+        os.chown(path, 65534, -1, follow_symlinks=False)
+    except PermissionError:
+        pytest.skip("only root gives a file away")
+
+
+def of_another_group(path):
+    path.chmod(0o775)
+    if path.stat().st_gid == os.geteuid():
+        try:
+            os.chown(path, -1, os.geteuid() + 1)
+        except PermissionError:
+            pytest.skip("only root gives a file to any group")
+
+
+def link_instead(path):
+    path.rename(path.with_name("elsewhere"))
+    path.symlink_to("elsewhere")
+
+
+@pytest.mark.parametrize("place", [".", *FOLDERS, CREATED, "lock"])
+@pytest.mark.parametrize("harm", [lambda path: path.chmod(0o777), of_another_group, give_away, link_instead])
+@pytest.mark.parametrize("do", ["look", "start", "follow", "end"])
+def test_a_folder_that_others_may_change_is_neither_used_nor_removed(tmp_path, capsys, place, harm, do):
+    root = tmp_path / "place"
+    with HostFolder(str(root), Channel()).locked():
+        (root / "workers" / "box").mkdir()
+        (root / "workers" / "box" / "log").touch()
+    harm(root / place)
+    asked = {**ending({"root": root}), "do": do, "name": "box", "words": [], "held": False}
+    before = sorted(tmp_path.rglob("*"))
+    if harm is link_instead and place == ".":  # this user's own, as to a larger disk
+        assert "ok" in answer({**asked, "do": "look"}, capsys)
+    else:
+        assert "--remote-dir" in answer(asked, capsys)["failed"]
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_link_of_another_user_is_no_folder(tmp_path, capsys):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "place").symlink_to("mine")
+    give_away(tmp_path / "place")
+    assert "--remote-dir" in answer(ending({"root": tmp_path / "place"}), capsys)["failed"]
+
+
+def test_a_folder_that_another_user_makes_meanwhile_takes_no_worker(tmp_path, capsys, monkeypatch):
+    enter = HostFolder._enter
+
+    def others_first(self):
+        self.root.mkdir()
+        self.root.chmod(0o777)
+        return enter(self)
+
+    monkeypatch.setattr(HostFolder, "_enter", others_first)
+    asked = {"do": "start", "root": str(tmp_path / "place"), "name": "box"}
+    assert "--remote-dir" in answer(asked, capsys)["failed"]
+    assert not (tmp_path / "place" / "workers").exists()
+
+
+def test_a_private_group_may_write_to_the_folder(tmp_path, capsys):
+    tmp_path.chmod(0o775)
+    try:
+        os.chown(tmp_path, -1, os.geteuid())
+    except PermissionError:
+        pytest.skip("this user has no private group")
+    assert "ok" in answer({"do": "look", "root": str(tmp_path)}, capsys)
+
+
 @pytest.mark.parametrize("root", ["~", "~/below/..", "~/..", "~nosuchuser/x"])
 def test_a_home_or_a_folder_above_it_takes_no_worker(tmp_path, capsys, monkeypatch, root):
     home = tmp_path / "me"
