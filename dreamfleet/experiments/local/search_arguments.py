@@ -80,7 +80,7 @@ def generations_within(budget: int, settings: Mapping[str, Any]) -> int:
     >>> means = {"evaluate_every": 10, "evaluation_episodes": 20, "confirm_episodes": 20}
     >>> noisy = {"population": 6, "episodes": 2, **means}
     >>> generations_within(400, noisy), generations_within(400, {**noisy, "racing": True})
-    (23, 31)
+    (23, 30)
     >>> generations_within(400, {"population": 8}), generations_within(51, noisy), generations_within(7, noisy)
     (50, 0, 0)
     """
