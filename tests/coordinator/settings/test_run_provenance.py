@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.errors import ControllerError, UsageError
+from dreamfleet.common.errors import ControllerError, JournalError, UsageError
 from dreamfleet.common.runs.effort import START_EFFORT, Effort
 from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.common.runs.run_paths import CONTROLLER
@@ -161,7 +161,7 @@ def test_a_run_is_compared_with_another_that_began_alike_and_why_they_differ_is_
         other = replace(again, receipt=replace(again.receipt, **changes))
         reasons.add(other.compare(second.path).why)
     assert len(reasons) == 5
-    with pytest.raises(ControllerError):
+    with pytest.raises(JournalError):
         again.compare(first.path.parent)
 
 
