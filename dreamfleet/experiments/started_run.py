@@ -26,7 +26,6 @@ from dreamfleet.common.host.user_code import own_arguments
 from dreamfleet.common.printable import suggest
 from dreamfleet.common.protocol.keys import check_run_name
 from dreamfleet.common.protocol.stop_kind import PauseKind
-from dreamfleet.common.protocol.tasks import check_task_trusted
 from dreamfleet.common.runs.records import StoredGeneration
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import default_runs_dir
@@ -218,7 +217,7 @@ def _resumed_task(name: object, runs_dir: Path | str | None) -> str | None:
     with open_run(default_runs_dir() if runs_dir is None else Path(runs_dir), name) as run:
         uid, spec = run.uid, run.spec
     trust_own_run(uid, spec.task, spec.options)
-    check_task_trusted(spec.task)
+    check_announced([spec.task])  # its workers trust the whole module, also of an environment
     return spec.task
 
 
