@@ -14,9 +14,13 @@ import psutil
 import pytest
 
 from dreamfleet.common.artifacts.bundle import MANIFEST
+from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.coordinator.addons.runs.stored_run import open_run
+from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.experiments.started_run import (
     RunPausedError,
     StartedRun,
@@ -243,4 +247,15 @@ def test_a_world_model_chooses_no_code_of_the_workers(alive, tmp_path, random_bu
             workers=1,
             runs_dir=tmp_path / "runs",
         )
+    assert not alive()
+
+
+@pytest.mark.parametrize("module", ["strangers_choice", "pickle"])  # also one that this process has loaded
+def test_a_runs_folder_chooses_no_code_of_the_workers(alive, tmp_path, module):
+    shape = ControllerShape(4, 2)
+    spec = TaskSpec(task=f"gym:{module}:Env-v0", bundle="", horizon=1, patience=0, controller=shape)
+    (tmp_path / "theirs").mkdir()
+    Journal.create(tmp_path / "theirs", RunSettings(spec, shape, 4, 1, 0.1, "diagonal", 1, 0, 1), None).close()
+    with pytest.raises(UsageError, match=f"--trust {module}"):
+        start_run(resume="theirs", runs_dir=tmp_path)
     assert not alive()
