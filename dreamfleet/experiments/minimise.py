@@ -5,24 +5,28 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib import import_module
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.objective import Objective, takes_seed
+from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.protocol.stop_kind import StopKind, StopReason
 from dreamfleet.common.runs.records import StoredGeneration, best_evaluation
 from dreamfleet.common.runs.run_paths import default_runs_dir, run_command
 from dreamfleet.common.schema.display import Displayed
-from dreamfleet.experiments.local.function_names import name_function
+from dreamfleet.experiments.local.function_names import is_noisy, name_function
 from dreamfleet.experiments.local.local_run import has_begun
-from dreamfleet.experiments.local.search_arguments import check_names, generations_within, read_objective, read_seed
+from dreamfleet.experiments.local.search_arguments import (
+    check_names,
+    generations_within,
+    limits_within,
+    read_objective,
+    read_seed,
+)
 from dreamfleet.experiments.started_run import RunPausedError, StartedRun, start_run_in
 
 Floats = NDArray[np.float64]
@@ -145,28 +149,6 @@ def maximise(
     return found.search(run, popsize, restarts, restart)
 
 
-def _is_noisy(function: Callable[..., Any] | str) -> bool:
-    if not isinstance(function, str):
-        return takes_seed(function)
-    module, _, name = function.rpartition("function:")[2].partition(":")
-    try:
-        return takes_seed(attrgetter(name)(import_module(module)))
-    except (ImportError, AttributeError) as error:
-        raise UsageError(f"no function {name} of module {module} here: {error}") from error
-
-
-def _limits_within(calls: int, settings: dict[str, Any], *, is_first: bool) -> dict[str, Any]:
-    """Settings by which a search ends before it has more calls; the first one of all has one generation at least.
-
-    Where no mean fits in beside it, none is evaluated.
-    """
-    limits = {"steps": settings.get("steps") or calls}  # for stages, which may have larger generations
-    if found := generations_within(calls, settings) or not is_first:
-        return {**limits, "generations": int(found)}
-    limits |= {"evaluate_every": 0, "target": None}
-    return {**limits, "generations": generations_within(calls, {**settings, **limits}) or 1}
-
-
 class _Plan(NamedTuple):
     """One search of several: its population, its first step in steps of sigma0, its seed, and most calls."""
 
@@ -186,7 +168,7 @@ class _Searches:
     ) -> None:  # fmt: skip
         check_names(settings)
         self._objective = read_objective(x0, sigma0, bounds, given)
-        self._function, self._is_noisy, self._settings = name_function(function), _is_noisy(function), settings
+        self._function, self._is_noisy, self._settings = name_function(function), is_noisy(function), settings
         self._ftarget, self._maxfevals, self._callback = ftarget, maxfevals, callback
         self._budget = maxfevals or 0  # 0: no limit
         self._workers, self._runs_dir = workers, runs_dir
@@ -276,7 +258,7 @@ class _Searches:
         objective = self._objective_of(plan, number)
         settings = {"run": name, "task_options": objective.options, **self._settings_of(plan)}
         if plan.calls:
-            settings |= _limits_within(plan.calls, settings, is_first=not number)
+            settings |= limits_within(plan.calls, settings, is_first=not number)
         with start_run_in(self._function.environment, self._workers, self._runs_dir, settings) as run:
             self._runs.append(run.name)
             self._first = len(self._history)

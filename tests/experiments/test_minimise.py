@@ -12,7 +12,7 @@ from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.coordinator.run.recall import bar_stored
 from dreamfleet.experiments import minimise as module
-from dreamfleet.experiments.local.search_arguments import read_bounds, read_objective
+from dreamfleet.experiments.local.search_arguments import limits_within, read_bounds, read_objective
 from tests.support import lying_tasks, objectives
 from tests.support.lying_tasks import LIES
 from tests.support.processes import free_port, until
@@ -268,7 +268,7 @@ def test_what_cannot_be_searched_is_refused_before_a_run_exists(change, named, t
 )
 def test_a_budget_below_one_generation_has_one_and_no_mean(calls, is_first, given, limits):
     noisy = {"population": 6, "target": -1.0, **module.NOISY, **given}
-    assert module._limits_within(calls, noisy, is_first=is_first) == {"steps": calls, **limits}
+    assert limits_within(calls, noisy, is_first=is_first) == {"steps": calls, **limits}
 
 
 def test_the_first_step_is_a_share_of_the_range_where_bounds_are_finite():

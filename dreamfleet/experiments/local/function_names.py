@@ -7,10 +7,12 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+from dreamfleet.common.artifacts.objective import takes_seed
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.trusted_modules import PLACES, check_module_name, join_places, module_folder
 from dreamfleet.common.protocol.tasks import FUNCTION, module_of
@@ -125,3 +127,14 @@ def _name_of_script(name: str) -> FunctionName:
         )
     path = Path(file).resolve()
     return FunctionName(f"{FUNCTION}:{path.stem}:{name}", path.parent)
+
+
+def is_noisy(function: Callable[..., Any] | str) -> bool:
+    """Whether it has a second parameter `seed`; `UsageError` for a name that is no function here."""
+    if not isinstance(function, str):
+        return takes_seed(function)
+    module, _, name = function.rpartition("function:")[2].partition(":")
+    try:
+        return takes_seed(attrgetter(name)(import_module(module)))
+    except (ImportError, AttributeError) as error:
+        raise UsageError(f"no function {name} of module {module} here: {error}") from error

@@ -100,6 +100,18 @@ def generations_within(budget: int, settings: Mapping[str, Any]) -> int:
     return min(limit, bisect_right(range(1, budget // generation + 1), budget, key=calls))
 
 
+def limits_within(calls: int, settings: Mapping[str, Any], *, is_first: bool) -> dict[str, Any]:
+    """Settings by which a search ends before it has more calls; the first one of all has one generation at least.
+
+    Where no mean fits in beside it, none is evaluated.
+    """
+    limits = {"steps": settings.get("steps") or calls}  # for stages, which may have larger generations
+    if found := generations_within(calls, settings) or not is_first:
+        return {**limits, "generations": int(found)}
+    limits |= {"evaluate_every": 0, "target": None}
+    return {**limits, "generations": generations_within(calls, {**settings, **limits}) or 1}
+
+
 def read_objective(x0: Any, sigma0: Any, bounds: Any, given: dict[str, Any]) -> Objective:
     """The objective in coordinates whose unit is `sigma0`, by default a share of each parameter's range."""
     start = _read_numbers("x0", x0)
