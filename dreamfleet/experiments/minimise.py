@@ -113,7 +113,8 @@ def minimise(
     returns `False` or raises `StopIteration`, or by a limit in `settings`, as a generation closes. Generations that
     close while the callback runs count too. `maxfevals` counts the calls for means too, and those by which a noisy
     search confirms its best ones at the end; of a call that fails and is tried again one. Only the first generation of
-    all may exceed it. Where no mean fits in beside that, none is evaluated, and `fun` is the best candidate's value.
+    all may exceed it, with `schedule` the last one too, and calls for candidates that are drawn anew or get other seeds
+    since they failed. Where no mean fits in, none is evaluated, and `fun` is the best candidate's value.
     The search begins anew up to `restarts` times, while a whole generation fits in, from a random point within bounds,
     else from `x0`: with twice the population (`ipop`), or with large and small ones in turn (`bipop`). `settings` are
     those of `start_run`, such as `generations`, `optimiser`, `episodes`, `seed` or `listen`; with `workers=0` only
