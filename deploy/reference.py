@@ -85,7 +85,7 @@ UNITS = {
     "worker.coordinator_timeout": "seconds",
 }  # fmt: skip
 RUN_ARGUMENTS = Path(__file__).parents[1] / "dreamfleet" / "experiments" / "local" / "run_arguments.py"
-RUN_ARGUMENTS_HEAD = '''"""Settings of `start_run` and `evolve`. Written by `make reference`: change the flags."""
+RUN_ARGUMENTS_HEAD = '''"""Settings of `start_run` and `evolve`. `make reference` writes it: change `RunConfig`."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -12,6 +12,7 @@ import json
 import re
 import sys
 import tokenize
+import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import suppress
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[1]
+CONFIG = tomllib.loads((ROOT / "pyproject.toml").read_text())
 SIDES = ("common", "coordinator", "worker", "dreamfleet/experiments")  # and the floor above both
 # Words that a reader has to read twice; `style` in CONTRIBUTING.md says what to write instead.
 RIDDLES = re.compile(r"\b(tell|tells|telling|told|untold|whoever|whomever)\b|\b(?:is|are|was|were|be|been) had\b")
@@ -194,31 +196,76 @@ def measure() -> dict[str, object]:
     return figures
 
 
+def is_in(module: str, package: str) -> bool:
+    """Whether a module is this package or lies in it (both dotted)."""
+    return f"{module}.".startswith(f"{package}.")
+
+
+def rules_of(module: str, users: set[str]) -> Iterator[str]:
+    """What the import contracts say of a module (dotted, with `dreamfleet.`), also through the modules that use it."""
+    for contract in CONFIG["tool"]["importlinter"]["contracts"]:
+        sources, layers = contract.get("source_modules", []), contract.get("layers", [])
+        for container in contract.get("containers", [""]):
+            rooms = [[f"{container}.{room}".lstrip(".") for room in layer.split(" | ")] for layer in layers]
+            for number, floor in enumerate(rooms):
+                if any(is_in(module, room) for room in floor):
+                    below = [room.removeprefix("dreamfleet.") for layer in rooms[number + 1 :] for room in layer]
+                    yield f"of {container or 'dreamfleet'} it may import its room, and {', '.join(below) or 'no other'}"
+        own = any(is_in(module, each) for each in sources)
+        through = sorted({each for each in users for source in sources if is_in(each, source)})
+        if own or through or module in contract.get("modules", []):
+            forbidden = ", ".join(contract.get("forbidden_modules", []))
+            by = "" if own or not through else f", as {through[0].removeprefix('dreamfleet.')} uses it"
+            yield f"{contract['name']}{by}{f': not {forbidden}' if forbidden else ''}"
+
+
+def users_of(module: str, imported: dict[Path, set[str]]) -> set[str]:
+    """All modules that import this one, also through others (dotted, with `dreamfleet.`)."""
+    found, new = set(), {module}
+    while new:
+        found |= new
+        new = {
+            f"dreamfleet.{module_of(path)}"
+            for path, names in imported.items()
+            if path.parts[0] != "tests" and any(is_in(f"dreamfleet.{name}", each) for name in names for each in new)
+        } - found
+    return found - {module}
+
+
 def about(path: Path) -> dict[str, list[str]]:
-    """What a change of a file (a path in the repository) may touch: its room, importers, tests and documents."""
-    module, room = module_of(path), path.parent / "__init__.py"
-    users = [
-        str(each)
-        for each in sources(*SIDES, "tests")
-        if any(f"{found}.".startswith(f"{module}.") for found in imports_of(each))
-    ]
-    name = str(path) if len(list(ROOT.glob(f"*/**/{path.name}"))) > 1 else path.name
-    documents = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
-    mirrored = f"tests/{path.parent}/test_{path.name}".replace("dreamfleet/", "")
-    listing = [str(each) for each in sources("tests") if re.search(rf"\b{name}\b", (ROOT / each).read_text())]
-    tests = {each for each in (mirrored, *listing, *users) if each.startswith("tests/") and (ROOT / each).exists()}
-    listed = f'"{path.stem}"' in (ROOT / room).read_text()
-    declared = re.findall(rf'.*"dreamfleet\.{re.escape(module)}[":].*', (ROOT / "pyproject.toml").read_text())
+    """What a change of a file (a path in the repository) may touch: its room, rules, importers, tests and documents."""
+    module, text, room = f"dreamfleet.{module_of(path)}", (ROOT / path).read_text(), path.parent / "__init__.py"
+    imported = {each: set(imports_of(each)) for each in sources(*SIDES, "tests")}
+    users = [each for each, names in imported.items() if any(is_in(f"dreamfleet.{name}", module) for name in names)]
+    file = str(path) if len(list(ROOT.glob(f"*/**/{path.name}"))) > 1 else path.name
+    public = [each.name for each in ast.parse(text).body if isinstance(each, (ast.ClassDef, ast.FunctionDef))]
+    named = rf"\b({re.escape(file)}|{re.escape(module)})\b"
+    spoken = re.compile("|".join([named, *(f"`{each}\\b" for each in public if not each.startswith("_"))]))
+    mirrored = Path(f"tests/{path.parent}/test_{path.name}".replace("dreamfleet/", ""))
+    tests = [
+        each for each in sources("tests")
+        if each in (mirrored, *users) or re.search(named, (ROOT / each).read_text())
+    ]  # fmt: skip
+    product = [each for each in users if each not in tests]
+    outside = [each for each in product if each.parent != path.parent]
+    if f'"{path.stem}"' in (ROOT / room).read_text():
+        listed = "the room lists it for others"
+    else:
+        listed = "the room's own" + (": no other room imports it" if not outside else ", and imported from elsewhere")
+    documents = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/**/*.md"))]
+    groups = CONFIG["project"]["entry-points"].items()
+    points = [f"{each}: {name}" for each, of in groups for name, value in of.items() if value.startswith(f"{module}:")]
     return {
-        str(path): [ast.get_docstring(ast.parse((ROOT / path).read_text())) or ""],
-        str(path.parent): [
-            ast.get_docstring(ast.parse((ROOT / room).read_text())) or "",
-            "the room lists it for others" if listed else "the room's own: no other room imports it",
+        str(path): [ast.get_docstring(ast.parse(text)) or ""],
+        str(path.parent): [ast.get_docstring(ast.parse((ROOT / room).read_text())) or "", listed],
+        "bound by": list(rules_of(module, users_of(module, imported))),
+        "imported by": list(map(str, product)),
+        "tests": list(map(str, tests)),
+        "entry points": points,
+        "named in": [
+            *(str(each.relative_to(ROOT)) for each in documents if spoken.search(each.read_text())),
+            *(str(each) for each in sources("deploy") if re.search(named, (ROOT / each).read_text())),
         ],
-        "imported by": [each for each in users if not each.startswith("tests/")],
-        "tests": sorted(tests),
-        "entry points": [each.strip() for each in declared],
-        "named in": [str(each.relative_to(ROOT)) for each in documents if name in each.read_text()],
     }
 
 

@@ -1,4 +1,7 @@
-"""The flags of a data set's world: the task, and what is seen of it, which the task's `parse_options` takes."""
+"""The flags of `collect`, `pipeline` and `iterate` for a data set's world: the task, and what is seen of it.
+
+The task's `parse_options` takes them.
+"""
 
 import argparse
 from typing import Any

@@ -1,4 +1,7 @@
-"""The world model: frozen in ONNX Runtime for inference, as torch modules for training, and the export between them."""
+"""The world model: frozen in ONNX Runtime for inference, as torch modules for training, and the export between them.
+
+What `scoring` imports of it has no torch.
+"""
 
 import os
 

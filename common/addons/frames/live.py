@@ -1,4 +1,4 @@
-"""Watching a worker while it scores: a stream of its newest live frames.
+"""Watching a worker while it scores: a stream of its newest live frames (Live frames in protocol.md).
 
 >>> with Client(address) as client, LiveView(client, "cartpole") as view:
 ...     for sight in view:

@@ -1,4 +1,4 @@
-"""What experiments stand on: processes of this host and their command lines, names of functions, kept documents."""
+"""What experiments stand on: processes of this host, their command lines, kept documents, arguments of searches."""
 
 __all__ = [
     "local_run",

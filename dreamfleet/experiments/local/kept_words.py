@@ -1,4 +1,4 @@
-"""Which code the words of a kept document may choose: its folder may come from somebody else.
+"""Which code the words of a kept document may choose, by docs/how-to/trust.md: its folder may be somebody else's.
 
 Such words become flags of child processes, and a child trusts each module that its flags name.
 """

@@ -1,4 +1,4 @@
-"""Settings of `start_run` and `evolve`. Written by `make reference`: change the flags."""
+"""Settings of `start_run` and `evolve`. `make reference` writes it: change `RunConfig`."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

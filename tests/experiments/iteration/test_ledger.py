@@ -1,4 +1,5 @@
-"""What is finished, as the folder keeps it. Tests dreamfleet/experiments/local/kept_document.py."""
+"""What is finished, as the folder keeps it. Tests dreamfleet/experiments/local/kept_document.py
+and kept_words.py."""
 
 import argparse
 import json
