@@ -1,9 +1,10 @@
-"""Tests journal.py, journal_connection.py, journal_file.py, result_records.py, verification_records.py and
-common/runs/records.py."""
+"""Tests file_watch.py, journal.py, journal_connection.py, journal_file.py, result_records.py, verification_records.py
+and common/runs/records.py."""
 
 import os
 import shlex
 import shutil
+import subprocess
 from functools import partial
 
 import numpy as np
@@ -21,6 +22,7 @@ from dreamfleet.coordinator.jobs.confirmation import Finalist
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.scoring_job import vector_bytes
+from dreamfleet.coordinator.storage import file_watch
 from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.coordinator.storage.journal_file import sqlite_side_files
 from dreamfleet.coordinator.storage.recall_records import REWOUND
@@ -295,3 +297,30 @@ def test_the_command_that_removes_a_run_in_the_way_names_its_folder_of_runs(fold
         Journal.check_absent(folder)
     _, *words = shlex.split(str(refused.value).split("`")[1])
     assert words == ["runs", "delete", folder.name, "--runs-dir", str(folder.parent)]
+
+
+def test_the_command_that_puts_a_rescued_journal_back_touches_no_other_file(tmp_path, random_bundle, monkeypatch):
+    monkeypatch.setattr(file_watch, "SETTLE", 0)
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "my runs" / "night"
+    others = [tmp_path / "my", tmp_path / "runs" / "night" / "journal.sqlite-wal"]
+    folder.mkdir(parents=True)
+    others[1].parent.mkdir(parents=True)
+    Journal.create(folder, SETTINGS, random_bundle.path).close()
+    journal = Journal(folder / "journal.sqlite")
+    watch = file_watch.FileWatch(journal, None, lambda _: "true")
+    watch.check(0.0)
+    journal.path.rename(folder / "away")
+    log = folder / "journal.sqlite-wal"
+    log.unlink(missing_ok=True)
+    for path in (journal.path, log, *others):
+        path.write_text("another program's")
+    with pytest.raises(JournalError) as left:
+        watch.check(1e9)
+    watch.close()
+    journal.close()
+    subprocess.run(["sh", "-ec", str(left.value).partition("Continue with: ")[2]], check=True)
+    assert not log.exists()
+    assert [each.read_text() for each in others] == ["another program's"] * 2
+    with RunFolder(folder) as run:
+        assert run.settings == SETTINGS

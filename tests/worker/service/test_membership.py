@@ -1,10 +1,7 @@
-"""When a worker says hello again, drains and leaves, for any order of events."""
+"""When a worker says hello again, drains and leaves."""
 
 import math
-
-from hypothesis import settings
-from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+from itertools import product
 
 from dreamfleet.worker.service.membership import (
     NEXT_RUN_AFTER,
@@ -22,7 +19,7 @@ from dreamfleet.worker.service.membership import (
 BEAT = 1.0
 SILENCE = SILENT_BEATS * BEAT
 TIMEOUT = 60.0  # of a coordinator out of sight
-IDLE = WorkerLoad(idle=True, awaits_verdict=False, uploading=False)
+LOADS = [WorkerLoad(*each) for each in product((True, False), repeat=3)]  # idle, awaits a verdict, uploads
 
 
 def joined(visible=True, **terms):
@@ -51,6 +48,36 @@ def test_a_coordinator_is_back_if_it_is_in_the_same_life():
     assert not member.add_coordinator("second")
 
 
+def test_it_says_hello_to_one_in_sight_that_is_silent_while_it_owes_an_answer_is_new_or_was_out_of_sight():
+    member = joined()
+    for load in LOADS:
+        patience = SILENCE + (UPLOAD_GRACE if load.uploading else 0.0)
+        for now in (SILENCE, SILENCE + 0.1, SILENCE + UPLOAD_GRACE, SILENCE + UPLOAD_GRACE + 0.1):
+            assert member.must_rejoin(now, load) == (now > patience and (load.idle or load.awaits_verdict))
+    member.note_activity(100.0)
+    assert not any(member.must_rejoin(100.0 + SILENCE, load) for load in LOADS)
+    member.add_coordinator("second")
+    member.remove_coordinator("second", 100.0)
+    assert not any(member.must_rejoin(100.0, load) for load in LOADS), "it was another's"
+    member.remove_coordinator("first", 100.0)
+    assert not any(member.must_rejoin(math.inf, load) for load in LOADS), "nobody would answer"
+    for nonce in ("first", "second"):  # it was out of sight; then another incarnation is there
+        member.add_coordinator(nonce)
+        member.remove_coordinator("third", 100.0)
+        assert all(member.must_rejoin(100.0, load) for load in LOADS)
+        member.note_hello_sent(100.0, pause=2.0)
+        assert not any(member.must_rejoin(101.9, load) for load in LOADS), "it never asks without a pause"
+        assert all(member.must_rejoin(102.0, load) for load in LOADS)
+        member.rejoin(nonce, 102.0)
+        assert not any(member.must_rejoin(102.0 + SILENCE, load) for load in LOADS)
+        member.remove_coordinator(nonce, 103.0)
+        member.note_hello_sent(100.0, pause=0.0)
+    member.add_coordinator("second")
+    member.rejoin("second", 104.0)
+    member.suspect_forgotten()
+    assert all(member.must_rejoin(104.0, load) for load in LOADS), "its batches have a newer numbering"
+
+
 def test_it_looks_for_its_run_in_intervals_while_no_coordinator_is_in_sight():
     member = joined()
     assert not member.start_search_if_due(1e6), "one is in sight"
@@ -74,6 +101,7 @@ def test_only_a_worker_that_leaves_with_its_run_gives_its_coordinator_up_and_onl
     for member in (leaves, stays):
         assert not member.find_end(1e6, busy=False)
         member.remove_coordinator("first", 1e6)
+        member.remove_coordinator("second", 1e6 + 9.0)
         assert not member.find_end(1e6 + TIMEOUT, busy=False), "it waits for a restart although it has nothing"
         assert not member.gives_up(1e6 + TIMEOUT)
     assert leaves.find_end(1e6 + TIMEOUT + 0.1, busy=True)
@@ -101,9 +129,24 @@ def test_stopped_once_it_drains_until_all_is_delivered_and_names_why():
         assert each.start_draining_if_due(1.0)
         assert not each.start_draining_if_due(1.1), "it begins once"
         assert (each.is_leaving(1.1), each.draining) == (True, True)
-    assert not member.find_end(30.9, busy=True)
+    assert not member.find_end(31.0, busy=True)
     assert "" != expired.find_end(1.1, busy=False) != member.find_end(1.1, busy=False) != ""
     assert "--drain-timeout" in member.find_end(31.1, busy=True)
+    for each in (member, expired):
+        each.remove_coordinator("first", 2.0)
+        assert not each.find_end(2.0 + SEARCH_INTERVAL, busy=True)
+    assert member.find_end(2.1 + SEARCH_INTERVAL, busy=True), "nobody takes what is left"
+    assert not expired.find_end(2.1 + SEARCH_INTERVAL, busy=True), "unless it is stopped, it waits for its coordinator"
+    expired.stop()
+    expired.stop()
+    assert expired.find_end(1.1, busy=True), "two signals are not drained"
+
+
+def test_a_worker_that_drains_does_not_give_its_coordinator_up():
+    member = joined(visible=False, leaves_with_run=True, coordinator_timeout=TIMEOUT, lifetime=TIMEOUT)
+    assert not member.gives_up(TIMEOUT + 0.1)
+    assert not member.find_end(TIMEOUT + 0.1, busy=True)
+    assert not member.is_leaving(TIMEOUT - 0.1)
 
 
 def test_runs_that_refused_are_asked_again_each_with_its_own_growing_pauses_until_it_accepts():
@@ -119,100 +162,3 @@ def test_runs_that_refused_are_asked_again_each_with_its_own_growing_pauses_unti
     refusals.forget("night")
     assert refusals.refusing_runs(now) == {"day"}
     assert refusals.add("night", now) == 1.0
-
-
-class AnyOrder(RuleBasedStateMachine):
-    """A worker among coordinators that come and go, compared with a simple model of what happened."""
-
-    nonces = st.sampled_from(["first", "second", "third"])
-    hands = st.builds(WorkerLoad, idle=st.booleans(), awaits_verdict=st.booleans(), uploading=st.booleans())
-
-    def __init__(self):
-        super().__init__()
-        self.now = 0.0
-        terms = {"lifetime": 200.0, "drain_timeout": 30.0, "leaves_with_run": True, "coordinator_timeout": TIMEOUT}
-        self.terms, self.member = LeaveConditions(**terms), joined(visible=False, **terms)
-        self.seen, self.of, self.doubt = set(), "first", False
-        self.spoke = self.alone = self.allowed = 0.0
-        self.stops = self.drains = 0
-
-    @rule(nonce=nonces)
-    def a_token_appears(self, nonce):
-        self.member.add_coordinator(nonce)
-        self.seen.add(nonce)
-
-    @rule(nonce=nonces)
-    def a_token_vanishes(self, nonce):
-        if self.seen == {nonce}:
-            self.alone = self.now
-        self.member.remove_coordinator(nonce, self.now)
-        self.seen.discard(nonce)
-        self.doubt |= nonce == self.of
-
-    @rule()
-    def the_coordinator_speaks(self):
-        self.member.note_activity(self.now)
-        self.spoke = self.now
-
-    @rule(seconds=st.floats(0.01, 20.0))
-    def time_passes(self, seconds):
-        self.now += seconds
-
-    @rule()
-    def it_is_stopped(self):
-        self.member.stop()
-        self.stops += 1
-
-    @rule(hands=hands, answers=st.booleans(), pause=st.floats(0.1, 2.0))
-    def it_asks_if_it_must(self, hands, answers, pause):
-        must = self.member.must_rejoin(self.now, hands)
-        timeout = SILENCE + (UPLOAD_GRACE if hands.uploading else 0)
-        forgotten = self.now - self.spoke > timeout and (hands.idle or hands.awaits_verdict)
-        reason = self.doubt or self.of not in self.seen or forgotten
-        assert must == (bool(self.seen) and self.now >= self.allowed and reason)
-        if not must:
-            return
-        self.member.note_hello_sent(self.now, pause)
-        self.allowed = self.now + pause
-        if answers:
-            self.of, self.doubt, self.spoke = min(self.seen), False, self.now
-            self.member.rejoin(self.of, self.now)
-        self.now += 1e-9
-        assert not self.member.must_rejoin(self.now, hands), "it never asks without a pause"
-
-    @rule()
-    def it_drains_if_it_must(self):
-        if self.member.start_draining_if_due(self.now):
-            self.drains += 1
-            self.drain_until = self.now + self.terms.drain_timeout
-
-    @rule()
-    def a_coordinator_that_stays_knows_it_in_the_end(self):
-        """From any state: one coordinator is there, answers and speaks; nothing is then left to ask."""
-        for nonce in list(self.seen - {"third"}):
-            self.a_token_vanishes(nonce)
-        self.a_token_appears("third")
-        self.now = max(self.now, self.allowed)
-        self.it_asks_if_it_must(IDLE, answers=True, pause=1.0)
-        self.the_coordinator_speaks()
-        self.now += SILENCE / 2
-        assert not self.member.must_rejoin(self.now, IDLE)
-
-    @invariant()
-    def it_leaves_for_a_reason_and_then_only(self):
-        assert self.member.is_leaving(self.now) == (self.stops > 0 or self.now >= self.terms.lifetime)
-        assert self.drains <= 1
-        for busy in (True, False):
-            is_over = bool(self.member.find_end(self.now, busy))
-            if self.stops > 1:
-                assert is_over
-            elif self.drains:
-                is_alone = self.stops and not self.seen and self.now - self.alone > SEARCH_INTERVAL
-                assert is_over == bool(not busy or self.now > self.drain_until or is_alone)
-            else:
-                given_up = not self.seen and self.now - self.alone > TIMEOUT
-                assert is_over == (given_up and not self.member.is_leaving(self.now))
-
-
-TestAnyOrder = AnyOrder.TestCase
-TestAnyOrder.settings = settings(max_examples=100, stateful_step_count=50)

@@ -1,5 +1,5 @@
 """A run's journal as CSV, Parquet and TensorBoard's events, read back by those who read such files.
-Tests backup.py and common/addons/analysis/scored_history.py."""
+Tests backup.py, stored_run.py and common/addons/analysis/scored_history.py."""
 
 import csv
 import json
@@ -7,24 +7,27 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from typing import get_args
 
 import pytest
 from pyarrow import parquet
 
 from dreamfleet.common.cli import command_line
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.errors import BundleError, ControllerError, MissingExtraError, UsageError
 from dreamfleet.common.host.processes import command
 from dreamfleet.common.runs.run_folder import CONFIRMED, RunFolder
 from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.coordinator.addons.runs import backup
-from dreamfleet.coordinator.addons.runs.export import export_csv, export_parquet, export_tensorboard
+from dreamfleet.coordinator.addons.runs.export import ELITES, TABLES, export_csv, export_parquet, export_tensorboard
+from dreamfleet.coordinator.addons.runs.plot import KINDS, fitness_figure, save_figure
+from dreamfleet.coordinator.addons.runs.stored_run import TableName, open_run
 from dreamfleet.coordinator.run.recall import bar_stored
 from dreamfleet.experiments.verbs.compare import SAME_SEEDS
 from tests.support.disks import small_disk
 from tests.support.events import scalars
 from tests.support.failing_runs import SETTINGS, finished
 from tests.support.journals import change_journal, change_settings, confirm
-from tests.support.processes import DEADLINE, call_here, printed
+from tests.support.processes import DEADLINE, call_here, environment, printed
 from tests.support.tables import cells
 
 
@@ -212,3 +215,87 @@ def test_no_copy_is_made_inside_the_run(tmp_path, random_bundle):
     with RunFolder(bench.path) as source, pytest.raises(UsageError):
         backup.back_up(source, bench.path / bench.path.name)
     assert not (bench.path / bench.path.name).exists()
+
+
+@pytest.fixture
+def reality(runs):
+    with open_run("reality") as run:
+        yield run
+
+
+@pytest.mark.parametrize("package", ["pandas", "polars"])
+def test_tables_are_data_frames(reality, package):
+    pytest.importorskip(package)
+    frame = getattr(reality, f"to_{package}")
+    history, scores = reality.history(), reality.evaluations()
+    assert list(frame()["mean"]) == [each.mean for each in history]
+    assert list(frame("evaluations")["error"]) == [each.error for each in scores]
+    assert len(frame("candidates")) == len(reality.candidates())
+    assert list(frame("candidates").columns)[:3] == ["generation", "number", "fitness"]
+    assert len(frame("confirmation")) == 0  # its columns are there
+    assert "mean" in frame("confirmation").columns
+
+
+def test_a_wrong_table_names_those_that_there_are(reality):
+    with pytest.raises(UsageError, match="generations, candidates, evaluations, confirmation"):
+        reality.to_pandas("candidate")
+    with pytest.raises(UsageError, match="--archive"):
+        reality.to_pandas("elites")
+
+
+@pytest.mark.parametrize(
+    ("call", "package", "remedy"),
+    [("to_pandas", "pandas", "pip install pandas"), ("to_polars", "polars", "pip install polars"),
+     ("plot", "matplotlib", r"pip install 'dreamfleet\[views\]'")],
+)  # fmt: skip
+def test_without_the_package_the_error_names_what_to_install(reality, monkeypatch, call, package, remedy):
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(MissingExtraError, match=f"{package!r}.*{remedy}"):
+        getattr(reality, call)()
+
+
+@pytest.mark.parametrize("kind", ["fitness", "learning"])
+def test_it_plots_what_the_verb_plots(reality, tmp_path, kind):
+    printed("runs", "plot", "reality", "--kind", kind, "--out", tmp_path / "verb.png")
+    reality.plot(kind).savefig(tmp_path / "own.png", dpi=120)
+    assert (tmp_path / "verb.png").read_bytes() == (tmp_path / "own.png").read_bytes()
+
+
+def test_a_run_without_evaluations_has_its_fitness_plotted(runs, tmp_path):
+    with open_run("hidden") as run:
+        assert run.plot().axes[0].get_ylabel()
+        with pytest.raises(UsageError, match="--evaluate-every"):
+            run.plot("learning")
+        with pytest.raises(UsageError, match=r"archive.*'curve'"):
+            run.plot("curve")
+        save_figure(fitness_figure(run), tmp_path / f"own{KINDS[1]}")
+
+
+SHOWN = """
+import dreamfleet, sys
+from IPython.core.formatters import DisplayFormatter
+run = dreamfleet.open_run('reality')
+for kind in ('fitness', 'learning'):
+    shown, _ = DisplayFormatter().format(run.plot(kind))
+    assert shown['image/png'].startswith(b'\\x89PNG'), (kind, shown.keys())
+assert 'matplotlib.pyplot' not in sys.modules
+"""
+
+
+def test_a_fresh_notebook_shows_plots(runs, tmp_path):
+    pytest.importorskip("IPython")
+    subprocess.run([sys.executable, "-c", SHOWN], env=environment(tmp_path), check=True, timeout=DEADLINE)
+
+
+def test_the_names_of_tables_are_known_to_type_checkers():
+    assert get_args(TableName) == (*TABLES, ELITES)
+
+
+def test_its_controller_and_world_model_are_those_of_its_folder(reality):
+    assert reality.controller().bundle == reality.bundle().sha256
+    reality.bundle_path.unlink()
+    with pytest.raises(BundleError, match="bundle"):
+        reality.bundle()
+    reality.controller_path.unlink()
+    with pytest.raises(ControllerError, match="reality"):
+        reality.controller()
