@@ -295,8 +295,8 @@ def test_a_reader_takes_nothing_from_a_coordinator(folder, journal):
 def test_the_command_that_removes_a_run_in_the_way_names_its_folder_of_runs(folder):
     with pytest.raises(JournalError) as refused:
         Journal.check_absent(folder)
-    _, *words = shlex.split(str(refused.value).split("`")[1])
-    assert words == ["runs", "delete", folder.name, "--runs-dir", str(folder.parent)]
+    words = shlex.split(str(refused.value).split("`")[1])
+    assert words[-5:] == ["runs", "delete", folder.name, "--runs-dir", str(folder.parent)]
 
 
 def test_the_command_that_puts_a_rescued_journal_back_touches_no_other_file(tmp_path, random_bundle, monkeypatch):

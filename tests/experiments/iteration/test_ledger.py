@@ -1,5 +1,5 @@
-"""What is finished, as the folder keeps it. Tests dreamfleet/experiments/local/kept_document.py
-and kept_words.py."""
+"""What is finished, as the folder keeps it.
+Tests dreamfleet/experiments/local/kept_document.py and dreamfleet/experiments/local/kept_words.py."""
 
 import argparse
 import json
