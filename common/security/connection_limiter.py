@@ -5,6 +5,9 @@ failed one (https://github.com/eclipse-zenoh/zenoh/issues/2685). So a few hundre
 for a minute, and a process that ran out of descriptors never recovers. While more than `MAX_UNAUTHENTICATED`
 connections are unauthenticated, a socket filter makes the kernel drop packets of new ones. Open connections stay, and a
 newcomer's kernel retries. Linux only: elsewhere there is no limit.
+
+It also closes connections of those that take part as routers without a router's or coordinator's seat, and lets nobody
+in for a while: between linked routers Zenoh would send others' messages through them.
 """
 
 import ctypes
@@ -17,15 +20,17 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Thread
-from time import sleep
+from time import monotonic, sleep
 
 import zenoh
 
 from dreamfleet.common.host.logs import log_event
+from dreamfleet.common.security.credentials import LISTENERS
 
 log = logging.getLogger("dreamfleet.router")
 MAX_UNAUTHENTICATED = 32  # at 100 ms each they are closed in three seconds
 SPARE_DESCRIPTORS = 16
+FALSE_ROUTER_BLOCK = 10.0  # seconds without new connections after a false router
 CHECK_INTERVAL = 0.02  # seconds between checks of the descriptors
 _OPEN = Path("/proc/self/fd")
 _ATTACH, _DETACH = 26, 27  # SO_ATTACH_FILTER and SO_DETACH_FILTER of Linux's asm-generic/socket.h
@@ -44,13 +49,20 @@ class _ConnectionLimiter:
         self._info, self._ports = session.info, ports
         self._listening = [each for each in self._port_descriptors() if self._is_listening(each)]
         self._open, self._unauthenticated = 0, 0
+        self._links_changed = True
+        self._link_events = self._info.declare_link_events_listener(self._note_link)
+        self._blocked_until = 0.0  # by the monotonic clock
+        self._warned: set[str | None] = set()  # seats whose connections were closed
         # Out of descriptors, Zenoh only reports that and completes no handshake; closing these lets it continue.
         self._spare = _open_spare_descriptors()
         self._blocked = False
 
     def run(self) -> None:
         while any(map(self._is_listening, self._listening)):  # querying a session that is being closed breaks it
-            if self._is_crowded() != self._blocked:
+            if self._links_changed:
+                self._links_changed = False
+                self._close_false_routers()
+            if (self._is_crowded() or monotonic() < self._blocked_until) != self._blocked:
                 self._set_blocked(not self._blocked)
             sleep(CHECK_INTERVAL)
         self._close_spare()
@@ -76,10 +88,31 @@ class _ConnectionLimiter:
                     self._close_waiting(listening)
         if blocked:
             self._close_spare()
-            text = f"more than {MAX_UNAUTHENTICATED} connections are unauthenticated: new ones wait"
-            log_event(log, "crowd", text, level=logging.WARNING, unproven=self._unauthenticated)
+            if self._unauthenticated > MAX_UNAUTHENTICATED:
+                text = f"more than {MAX_UNAUTHENTICATED} connections are unauthenticated: new ones wait"
+                log_event(log, "crowd", text, level=logging.WARNING, unproven=self._unauthenticated)
         else:
             self._spare = _open_spare_descriptors()
+
+    def _note_link(self, _event: zenoh.LinkEvent) -> None:
+        self._links_changed = True
+
+    def _close_false_routers(self) -> None:
+        """Close the connections of sessions that route, but have no seat that may."""
+        routing = {str(each.zid) for each in self._info.transports() if str(each.whatami) != "client"}
+        links = [each for each in self._info.links() if str(each.zid) in routing] if routing else []
+        seats = {each.dst: each.auth_identifier for each in links if not _may_route(each.auth_identifier)}
+        if not seats:
+            return
+        self._blocked_until = monotonic() + FALSE_ROUTER_BLOCK
+        for number in self._port_descriptors():
+            with suppress(OSError), _as_socket(number) as found:
+                if _remote_end(found) in seats:
+                    found.shutdown(socket.SHUT_RDWR)
+        for seat in set(seats.values()) - self._warned:
+            text = f"{seat} takes part as a router, which it may not: its connections are closed, and new ones wait"
+            log_event(log, "false_router", text, level=logging.WARNING, identity=seat)
+        self._warned |= set(seats.values())
 
     def _close_waiting(self, listening: socket.socket) -> None:
         """Close waiting connections, which would take the spare descriptors; Zenoh may accept some of them first."""
@@ -115,6 +148,16 @@ def _open_spare_descriptors() -> list[int]:
         while len(found) < SPARE_DESCRIPTORS:
             found.append(os.open(os.devnull, os.O_RDONLY))
     return found
+
+
+def _may_route(seat: str | None) -> bool:
+    return seat is None or seat.partition(".")[0] in LISTENERS  # None: by a password, of which Zenoh says nothing
+
+
+def _remote_end(connection: socket.socket) -> str:
+    """The other side of a connection, as Zenoh writes it."""
+    host, port = connection.getpeername()[:2]
+    return f"tls/[{host}]:{port}" if ":" in host else f"tls/{host}:{port}"
 
 
 def _local_port(number: int) -> int:

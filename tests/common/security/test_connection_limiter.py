@@ -1,3 +1,4 @@
+import json
 import logging
 import socket
 import sys
@@ -5,12 +6,13 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 
 import pytest
+import zenoh
 
 from dreamfleet.common.addons.access.authority import Authority
 from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.security.connection_limiter import MAX_UNAUTHENTICATED
 from dreamfleet.common.security.credentials import read_join_file
-from dreamfleet.common.transport.session import Network, open_session
+from dreamfleet.common.transport.session import Network, open_session, zenoh_config
 from tests.support.processes import DEADLINE, free_port, until
 
 
@@ -44,6 +46,40 @@ def test_many_unauthenticated_connections_delay_only_new_ones(tmp_path, caplog):
                 fleet.enter_context(session)
             assert joined(viewer)
     open_session(home).close()  # its port is free
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="descriptors of this process are found in /proc")
+@pytest.mark.parametrize("mode", ["router", "peer"])
+def test_only_seats_that_listen_take_part_as_routers(tmp_path, caplog, mode):
+    authority, port = Authority.create(tmp_path / "access"), free_port()
+    files = {}
+    for role in ("coordinator", "router", "worker"):
+        connect = [] if role == "coordinator" else ["tls/127.0.0.1:7447"]
+        authority.issue(role, role, tmp_path / role, connect=connect)
+        files[role] = read_join_file(tmp_path / role)
+    endpoint = f"tls/127.0.0.1:{port}"
+    caplog.set_level(logging.WARNING, "dreamfleet.router")
+
+    def facts():
+        return [getattr(each, "facts", {}) for each in caplog.records]
+
+    def sessions(whatami):
+        return sum(str(each.whatami) == whatami for each in home.info.transports())
+
+    with ExitStack() as stack:
+        home = stack.enter_context(open_session(Network(listen=(endpoint,), credentials=files["coordinator"])))
+        stack.enter_context(open_session(Network(connect=(endpoint,), credentials=files["worker"])))
+        far = Network(listen=(f"tls/127.0.0.1:{free_port()}",), connect=(endpoint,), credentials=files["router"])
+        stack.enter_context(open_session(far, timeout=None))
+        until(lambda: sessions("router") == 1, "the other router is not linked")
+        settings = zenoh_config(Network(connect=(endpoint,), credentials=files["worker"]), DEADLINE)
+        settings |= {"mode": mode, "listen": {"endpoints": []}}
+        stack.enter_context(zenoh.open(zenoh.Config.from_json5(json.dumps(settings))))
+        until(lambda: any(each.get("identity") == "worker.1" for each in facts()), "it is not noticed")
+        until(lambda: sessions("peer") == 0 and sessions("router") == 1, "it stays")
+        assert sessions("client") == 1
+        assert len(facts()) == 1
 
 
 def joined(network):
