@@ -1,4 +1,5 @@
-"""Adding a bad worker never makes a run slower by more than 5 %: hosts that take as long as each test says."""
+"""Adding a bad worker never makes a run slower by more than 5 %, and long links leave no slot idle for long: hosts that
+take as long as each test says."""
 
 import statistics
 from functools import cache
@@ -41,3 +42,9 @@ def test_a_bad_worker_makes_no_run_slower(fast, bad, size):
     alone = seconds_of_a_good_one(fast, size)
     both = mean_seconds(made("good", FAST[fast]), made("bad", FAST[fast], **BAD[bad]), size=size)
     assert both / alone < 1.05
+
+
+def test_slots_behind_long_links_score_nearly_all_of_the_time():
+    hosts = [Host(f"far {number}", {"score": 1.0}, slots=4, delay=0.1) for number in range(3)]
+    seconds = statistics.mean(Played(*hosts, population=48, episodes=1).play(10))
+    assert 48 / 12 / seconds > 0.93
