@@ -86,7 +86,7 @@ def _drive(fleet, processes, stage, faults, happened):
             if happened.total() < faults and done >= next_fault:
                 next_fault = done + stage.jobs_a_fault
                 name = fleet.random.choices(*zip(*possible.items(), strict=True))[0]
-                KINDS[name].strike(fleet, fleet.random.randrange(len(fleet.workers)))
+                KINDS[name](fleet, fleet.random.randrange(len(fleet.workers)))
                 happened[name] += 1
                 if happened.total() % 20 == 0:
                     print(f"{stage.name}: {happened.total()} faults, {done} results", file=sys.stderr, flush=True)
@@ -147,12 +147,8 @@ def main():
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--kinds", default=",".join(KINDS), help=f"of faults, with commas between: {', '.join(KINDS)}")
     parser.add_argument("--without", default="", help="kinds that are left out")
-    parser.add_argument(
-        "--stage",
-        choices=("narrow", "wide", "both", "failing"),
-        default="both",
-        help="slots of width 1, 256, both, and episodes that fail",
-    )
+    stages = ("narrow", "wide", "both", "failing")
+    parser.add_argument("--stage", choices=stages, default="both", help="width 1, 256, both; episodes that fail")
     parser.add_argument("--folder", type=Path, help="a new folder, which is kept")
     arguments = parser.parse_args()
     kinds = tuple(name for name in arguments.kinds.split(",") if name not in arguments.without.split(","))

@@ -3,32 +3,24 @@
 import os
 import shutil
 import signal
-from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
-from tests.chaos.fleet import WORKERS, Fleet, children, kill
+from tests.chaos.fleet import WORKERS, children, kill
 from tests.support import tasks
 
 EVERYBODY = range(WORKERS)
 
 
-@dataclass(frozen=True)
-class Kind:
-    """`strike` takes the fleet and the number of a worker; `possible` says whether this machine can do it."""
-
-    often: int
-    strike: Callable[[Fleet, int], None]
-    possible: Callable[[Fleet], bool] = lambda _fleet: True
-
-
-KINDS: dict[str, Kind] = {}
+KINDS = {}  # each takes the fleet and the number of a worker
 
 
 def kind(often, possible=lambda _fleet: True):
+    """A kind that comes so `often`; `possible` says whether this machine can do it to a fleet."""
+
     def register(strike):
-        KINDS[strike.__name__] = Kind(often, strike, possible)
+        KINDS[strike.__name__] = strike
+        strike.often, strike.possible = often, possible
         return strike
 
     return register

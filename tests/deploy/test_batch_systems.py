@@ -47,7 +47,7 @@ def start(processes):
 
 
 def await_slots(processes, count):
-    until(lambda: processes.statuses()[0].slots == count, f"no {count} slots")
+    until(lambda: processes.status()["slots"] == count, f"no {count} slots")
 
 
 def drained(begun):
@@ -69,7 +69,7 @@ def test_slurm_starts_a_worker_that_drains_before_its_limit(processes, coordinat
     begun = start(DEPLOY / "slurm" / "workers.sh", *worker_words(processes), **variables)
     coordinator.wait_for_event("generation", number=1)
     await_slots(processes, 2)
-    assert processes.statuses()[0].worker_list[0].worker.startswith("node3-7/")
+    assert processes.status()["worker_list"][0]["worker"].startswith("node3-7/")
     drained(begun)
     await_slots(processes, 0)
     near = {"SLURM_JOB_END_TIME": str(int(time.time()) + 95)}

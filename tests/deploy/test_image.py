@@ -4,6 +4,7 @@ No container engine is needed, but root and debootstrap are. Packages are fetche
 the steps run without any index.
 """
 
+import json
 import os
 import re
 import shlex
@@ -45,6 +46,15 @@ class Stage:
         subprocess.run(["cp", "-a", self.root, root], check=True)
         return Stage(root, dict(self.variables), self.folder, self.user)
 
+    def run(self, script, wheels):
+        given = self.root / "given"
+        given.mkdir(exist_ok=True)
+        words = self.command("sh", "-c", script, mounts=[(wheels, "/given")], PIP_NO_INDEX="1",
+                             PIP_FIND_LINKS="/given", DEBIAN_FRONTEND="noninteractive")  # fmt: skip
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        given.rmdir()
+        assert done.returncode == 0, f"{script}\n{done.stdout[-3000:]}{done.stderr[-3000:]}"
+
     def command(self, *words, read_only=False, mounts=(), **variables):
         """A command that runs words inside, isolated from this process's environment."""
         root = shlex.quote(str(self.root))
@@ -60,75 +70,52 @@ class Stage:
         return ["unshare", "--mount", "--pid", "--fork", "sh", "-ec", "\n".join(script)]
 
 
-class Build:
-    """Executes a Containerfile stage by stage, as far as this project's file needs."""
-
-    def __init__(self, base, folder, wheels):
-        self._base, self._folder, self._wheels = base, folder, wheels
-        self.stages = {}
-
-    def run(self, text):
-        kept = "\n".join(line for line in text.splitlines() if not line.startswith("#"))
-        for line in filter(str.strip, re.split(r"(?<!\\)\n", kept)):
-            name, rest = re.match(r"([A-Z]+)\s+(.*)", line, re.DOTALL).groups()
-            getattr(self, f"_{name.lower()}")(rest)
-
-    def _arg(self, rest):
-        name, _, default = rest.partition("=")
-        if name == "PYTHON":
-            assert default.startswith("python:3.11-")  # the version in Debian
+def copy(source, names, there, ignore):
+    """As image builders do: of a folder its content."""
+    for path in (source / name.lstrip("/") for name in names):
+        if path.is_dir():
+            shutil.copytree(path, there, symlinks=True, dirs_exist_ok=True, ignore=ignore)
         else:
-            self.now.variables[name] = default
+            into = there / path.name if there.is_dir() else there
+            into.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(path, into)
 
-    def _from(self, rest):
-        origin, _, name = rest.split()
-        before = Stage(self._base) if origin == "${PYTHON}" else self.stages[origin]
-        self.now = self.stages[name] = before.derived(self._folder / f"stage-{name}")
 
-    def _run(self, rest):
-        wheels = self.now.root / "given"
-        wheels.mkdir(exist_ok=True)
-        words = self.now.command("sh", "-c", rest, mounts=[(self._wheels, "/given")], PIP_NO_INDEX="1",
-                                 PIP_FIND_LINKS="/given", DEBIAN_FRONTEND="noninteractive")  # fmt: skip
-        done = subprocess.run(words, capture_output=True, text=True, check=False)
-        wheels.rmdir()
-        assert done.returncode == 0, f"{rest}\n{done.stdout[-3000:]}{done.stderr[-3000:]}"
-
-    def _copy(self, rest):
-        found = re.match(r"--from=(\S+)\s+(.*)", rest)
-        source = self.stages[found[1]].root if found else ROOT
-        *names, target = (found[2] if found else rest).split()
-        there = self.now.root / (Path(self.now.folder) / target).as_posix().lstrip("/")
-        for name in names:
-            path = source / name.lstrip("/")
-            if path.is_dir():  # its content, as image builders do
-                shutil.copytree(path, there, symlinks=True, dirs_exist_ok=True, ignore=None if found else
-                                shutil.ignore_patterns("__pycache__", "*.so"))  # fmt: skip
-            else:
-                into = there / path.name if target.endswith("/") or target in (".", "./") else there
-                into.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy2(path, into)
-
-    def _workdir(self, rest):
-        self.now.folder = rest
-        (self.now.root / rest.lstrip("/")).mkdir(parents=True, exist_ok=True)
-
-    def _env(self, rest):
-        self.now.variables |= dict(each.split("=", 1) for each in rest.replace("\\\n", " ").split())
-
-    def _user(self, rest):
-        self.now.user = rest
-
-    def _entrypoint(self, rest):
-        self.now.entry = [word.strip('"') for word in rest.strip("[]").split(", ")]
-
-    def _volume(self, rest):
-        assert (self.now.root / rest.lstrip("/")).is_dir()
-
-    def _expose(self, rest):
-        """Nothing: it only informs container engines."""
-
-    _cmd = _expose
+def built(text, base, folder, wheels):
+    """The stages of a Containerfile, as far as this project's file needs."""
+    stages = {}
+    kept = "\n".join(line for line in text.splitlines() if not line.startswith("#"))
+    for line in filter(str.strip, re.split(r"(?<!\\)\n", kept)):
+        word, rest = re.match(r"([A-Z]+)\s+(.*)", line, re.DOTALL).groups()
+        match word, rest.split():
+            case "ARG", [given] if given.startswith("PYTHON="):
+                assert given.startswith("PYTHON=python:3.11-")  # the version in Debian
+            case "FROM", [origin, "AS", name]:
+                before = Stage(base) if origin == "${PYTHON}" else stages[origin]
+                now = stages[name] = before.derived(folder / f"stage-{name}")
+            case "ARG" | "ENV", _:
+                now.variables |= dict(each.split("=", 1) for each in rest.replace("\\\n", " ").split())
+            case "RUN", _:
+                now.run(rest, wheels)
+            case "COPY", [*flags, target]:
+                origin = flags.pop(0).removeprefix("--from=") if flags[0].startswith("--from=") else ""
+                there = now.root / (Path(now.folder) / target).as_posix().lstrip("/")
+                if target.endswith("/"):
+                    there.mkdir(parents=True, exist_ok=True)
+                unwanted = None if origin else shutil.ignore_patterns("__pycache__", "*.so")
+                copy(stages[origin].root if origin else ROOT, flags, there, unwanted)
+            case "WORKDIR", _:
+                now.folder = rest
+                (now.root / rest.lstrip("/")).mkdir(parents=True, exist_ok=True)
+            case "USER", _:
+                now.user = rest
+            case "ENTRYPOINT", _:
+                now.entry = json.loads(rest)
+            case "VOLUME", _:
+                assert (now.root / rest.lstrip("/")).is_dir()
+            case _:
+                assert word in ("EXPOSE", "CMD"), line
+    return stages
 
 
 @pytest.fixture(scope="module")
@@ -141,9 +128,7 @@ def images(tmp_path_factory):
     packages = "--include=python3,python3-venv,python3-dev"
     subprocess.run(["debootstrap", "--variant=minbase", packages, "bookworm", base], check=True, capture_output=True)
     (base / "usr/local/bin/python").symlink_to("/usr/bin/python3")
-    build = Build(base, folder, wheels)
-    build.run(RECIPE.read_text())
-    yield build.stages
+    yield built(RECIPE.read_text(), base, folder, wheels)
     shutil.rmtree(folder)
 
 

@@ -5,7 +5,6 @@ import re
 import secrets
 import shlex
 import shutil
-import signal
 import subprocess
 from contextlib import ExitStack, contextmanager
 
@@ -95,12 +94,12 @@ def test_its_commands_lead_through_two_losses(tmp_path, processes):
         assert "red.1/" in status
         assert "blue.1/" in status
 
-        _kill(workers["blue"])
+        workers["blue"].end()
         coordinator.wait_for(on_page("is lost: it was killed, or its connection was cut"))
         workers["blue"] = start("blue", "worker --join lab.join --name blue")
         workers["blue"].wait_for(on_page("joined run night as"))
 
-        _kill(coordinator)
+        coordinator.end()
         for each in workers.values():
             each.wait_for(
                 on_page("the coordinator of run night left or cannot be reached; this worker waits for this run only")
@@ -118,8 +117,3 @@ def test_its_commands_lead_through_two_losses(tmp_path, processes):
             each.wait_for(on_page("leaving run night (the run dismissed its workers)"))
             assert each.finish()[0] == 0
         assert again.finish()[0] == 130
-
-
-def _kill(process):
-    os.killpg(process.popen.pid, signal.SIGKILL)
-    process.popen.wait()

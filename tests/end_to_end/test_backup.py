@@ -2,18 +2,17 @@
 
 import shlex
 import shutil
-import sqlite3
-from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL, ROLLOUTS
+from dreamfleet.common.runs.run_paths import BUNDLE, ROLLOUTS
 from dreamfleet.coordinator.addons.runs import backup
 from tests.support import tasks
+from tests.support.journals import change_journal
 from tests.support.processes import ROOT, call_here
-from tests.support.same_bits import outcome
+from tests.support.same_bits import evolve, outcome
 
 FIXTURES = ROOT / "tests" / "fixtures"
 GENERATIONS = 4
@@ -26,12 +25,7 @@ def back_up(processes, to, name="test", call=call_here):
 @pytest.mark.slow
 def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, small, random_bundle, tmp_path):
     flags = (*small, "--generations", GENERATIONS, "--collect-every", 1, "--collect-episodes", 1)
-    whole = processes.coordinator(*flags, name="whole")
-    worker = processes.worker("--run", "whole", "--task", tasks.SLOW_TOY)
-    assert whole.finish()[0] == 0
-    worker.end()
-
-    safe = tmp_path / "safe"
+    whole, safe = evolve(processes, "whole", 1, *flags, task=tasks.SLOW_TOY), tmp_path / "safe"
     served = processes.coordinator(*flags)
     for generation in (0, 1):
         worker = processes.worker("--run", "test", "--task", tasks.SLOW_TOY)
@@ -48,12 +42,11 @@ def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, 
         assert 2 <= len(copy.history()) < GENERATIONS
         assert all(path.is_file() for path in copy.rollouts())
 
-    code, _, err = processes.call("runs", "backup", "test", "--runs-dir", safe, "--to", processes.runs)
-    assert code == 0, err
+    processes.printed("runs", "backup", "test", "--runs-dir", safe, "--to", processes.runs)
     resumed = processes.resume()
     processes.worker("--run", "test", "--task", tasks.SLOW_TOY)
     assert resumed.finish()[0] == 0
-    assert outcome(processes, "test") == outcome(processes, "whole")
+    assert outcome(processes, "test") == whole
     assert len(list((processes.runs / "test" / ROLLOUTS).iterdir())) == GENERATIONS
 
 
@@ -63,6 +56,13 @@ def finished(processes):
     shutil.copytree(FIXTURES / "runs" / "dream", processes.runs / "test")
     shutil.copyfile(FIXTURES / "small.zip", processes.runs / "test" / BUNDLE)
     return processes
+
+
+@pytest.fixture
+def safe(finished, tmp_path):
+    """The folder of a copy of it."""
+    assert back_up(finished, tmp_path / "safe")[0] == 0
+    return tmp_path / "safe"
 
 
 def test_the_command_that_continues_the_copy_holds_in_any_folder(finished, tmp_path, monkeypatch):
@@ -80,9 +80,8 @@ def test_what_cannot_be_a_copy_is_left_alone(finished, tmp_path):
             (wrong / "test").mkdir(parents=True)
         elif wrong == other:
             assert back_up(finished, other)[0] == 0
-            with closing(sqlite3.connect(other / "test" / JOURNAL)) as journal, journal:
-                journal.execute("UPDATE run SET value = 'another' WHERE key = 'uid'")
-                journal.execute("DELETE FROM run WHERE key = 'checksum'")
+            change_journal(other / "test", "UPDATE run SET value = 'another' WHERE key = 'uid'")
+            change_journal(other / "test", "DELETE FROM run WHERE key = 'checksum'")
         code, _, err = back_up(finished, wrong)
         assert (code, str(wrong / "test") in err) == (2, True), err
     code, _, err = back_up(finished, "/proc/nowhere")
@@ -91,9 +90,7 @@ def test_what_cannot_be_a_copy_is_left_alone(finished, tmp_path):
     assert (code, "'nobody'" in err) == (1, True), err
 
 
-def test_a_call_that_was_killed_between_two_names_is_made_good(finished, tmp_path):
-    safe = tmp_path / "safe"
-    assert back_up(finished, safe)[0] == 0
+def test_a_call_that_was_killed_between_two_names_is_made_good(finished, safe):
     (safe / "test").rename(safe / ".test.former")
     (safe / ".test.part").mkdir()
     code, _, err = back_up(finished, safe)
@@ -101,9 +98,7 @@ def test_a_call_that_was_killed_between_two_names_is_made_good(finished, tmp_pat
     assert [path.name for path in safe.iterdir()] == ["test"]
 
 
-def test_a_call_that_is_interrupted_leaves_the_earlier_copy(finished, tmp_path, monkeypatch):
-    safe = tmp_path / "safe"
-    assert back_up(finished, safe)[0] == 0
+def test_a_call_that_is_interrupted_leaves_the_earlier_copy(finished, safe, monkeypatch):
     rename = Path.rename
 
     def interrupted(self, target):
@@ -119,9 +114,7 @@ def test_a_call_that_is_interrupted_leaves_the_earlier_copy(finished, tmp_path, 
         assert len(copy.history()) == 12
 
 
-def test_two_at_once_leave_a_whole_copy(finished, tmp_path, monkeypatch):
-    safe = tmp_path / "safe"
-    assert back_up(finished, safe)[0] == 0
+def test_two_at_once_leave_a_whole_copy(finished, safe, monkeypatch):
     lock, said = backup.run_lock, []
 
     def meanwhile(target):

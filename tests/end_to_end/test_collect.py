@@ -15,6 +15,7 @@ from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from dreamfleet.worker.worlds.car_racing.preprocessing import BOX, RAW
 from tests.support import tasks
 from tests.support.bundles import write_random_bundle
+from tests.support.same_bits import evolve
 
 GENERATIONS, DRIVES = 4, 3
 
@@ -40,10 +41,7 @@ def expected(generations=(1, 3)):
 def test_the_drives_are_a_function_of_the_run_and_not_of_the_worker(processes, settings):
     seen = []
     for name, workers in (("one", 1), ("three", 3)):
-        coordinator = processes.coordinator(*settings, "--task", tasks.TOY, name=name)
-        for number in range(workers):
-            processes.worker("--run", name, "--task", tasks.TOY, "--name", f"w{number}")
-        assert coordinator.finish()[0] == 0
+        evolve(processes, name, workers, *settings, "--task", tasks.TOY, task=tasks.TOY)
         seen.append(kept(processes, name))
     assert seen[0] == seen[1]
     assert sorted(seen[0]) == expected()
@@ -66,16 +64,13 @@ def test_the_drives_are_a_function_of_the_run_and_not_of_the_worker(processes, s
 def test_drives_of_the_real_car_are_episodes_that_a_data_set_takes_in_once(processes, tmp_path, preprocessing):
     vae = VAEConfig(picture=preprocessing.size, latent=4, channels=(2, 2, 2, 2))
     bundle = write_random_bundle(tmp_path / "b.zip", vae=vae, rnn=MDNRNNConfig(latent=4, hidden=4))
-    coordinator = processes.coordinator(
-        "--bundle", bundle.path, "--population", 2, "--episodes", 1, "--horizon", 30, "--evaluate-every", 0,
-        "--collect-every", 1, "--collect-episodes", 2, "--generations", 1,
+    evolve(
+        processes, "test", 1, "--bundle", bundle.path, "--population", 2, "--episodes", 1, "--horizon", 30,
+        "--evaluate-every", 0, "--collect-every", 1, "--collect-episodes", 2, "--generations", 1,
     )  # fmt: skip
-    processes.worker()
-    assert coordinator.finish()[0] == 0
     data = tmp_path / "data"
     for new in (2, 0):
-        code, out, err = processes.call("collect", "--data", data, "--from-run", "test", "--runs-dir", processes.runs)
-        assert code == 0, err
+        out = processes.printed("collect", "--data", data, "--from-run", "test", "--runs-dir", processes.runs)
         assert re.search(rf"\b{new} .* {30 * new} .* 2\b", out)
     with open_run(processes.runs, "test") as run:
         assert [path.read_bytes() for path in run.rollouts()] == [path.read_bytes() for path in episode_paths(data)]

@@ -2,23 +2,21 @@
 
 import dataclasses
 import json
-import shutil
 import signal
 import socket
 import time
 import urllib.error
 import urllib.request
 from contextlib import ExitStack
-from pathlib import Path
 
 import pytest
 
 from tests.support import tasks
-from tests.support.browser import dashboard, tab, wait_for_text, wait_until
-from tests.support.processes import DEADLINE, call_here, free_port
+from tests.support.browser import dashboard, tab, wait_until
+from tests.support.browser import wait_for_text as wait
+from tests.support.processes import DEADLINE, free_port, refused
 from tests.support.served import WORKER, serving, snapshot
 
-RUNS = Path(__file__).parents[1] / "fixtures" / "runs"
 TOKEN = "correct horse battery"
 PAINTED = "all => all.every(each => each.getContext('2d').getImageData(each.width - 4, 9, 1, 1).data[3] > 0)"
 LEFT_OUT = ("Failed to load resource", "net::ERR")  # what a browser says by itself of a server that is gone
@@ -29,10 +27,6 @@ def page(browser, processes):
     with dashboard(processes) as started, tab(browser) as page:
         page.goto(started.address)
         yield page
-
-
-def wait(page, text, part="state"):
-    wait_for_text(page, text, part)
 
 
 def drawn(page, text):
@@ -145,12 +139,10 @@ def test_several_live_runs_can_be_chosen_among(browser, processes):
 
 
 @pytest.mark.slow
-def test_past_runs_are_searched_sorted_opened_and_compared_by_keyboard(browser, processes, tmp_path):
-    for name in ("dream", "reality", "hidden"):
-        shutil.copytree(RUNS / name, tmp_path / "runs" / name)
-    (tmp_path / "runs" / "broken").mkdir()
-    (tmp_path / "runs" / "broken" / "journal.sqlite").write_text("no journal")
-    with dashboard(processes, runs=tmp_path / "runs") as started, tab(browser) as page:
+def test_past_runs_are_searched_sorted_opened_and_compared_by_keyboard(browser, processes, runs):
+    (runs / "broken").mkdir()
+    (runs / "broken" / "journal.sqlite").write_text("no journal")
+    with dashboard(processes) as started, tab(browser) as page:
         page.goto(f"{started.address}#/runs")
         rows = page.locator("[data-part=rows] tr")
         page.wait_for_selector("[data-part=rows] tr")
@@ -286,10 +278,8 @@ def test_what_cannot_be_served_is_one_line(processes):
         taken.listen()
         code, _, err = processes.call("dashboard", "--port", taken.getsockname()[1])
     assert (code, "--port" in err) == (1, True), err
-    code, _, err = call_here("dashboard", "--host", "0.0.0.0")
-    assert (code, "--token" in err) == (2, True), err
-    code, _, err = call_here("dashboard", "--run", "No Run")
-    assert (code, "'No Run'" in err) == (2, True), err
+    refused("--token", "dashboard", "--host", "0.0.0.0")
+    refused("'No Run'", "dashboard", "--run", "No Run")
 
 
 @pytest.mark.slow

@@ -6,7 +6,6 @@ wrote them gave when it continued them. CarRacing computes what it did when it w
 """
 
 import json
-import shutil
 from pathlib import Path
 
 import pytest
@@ -18,15 +17,6 @@ from tests.support.first_world import GOLD, HOST, PARTS
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 CONTINUED = json.loads((FIXTURES / "continued.json").read_text())
 NAMES = sorted(CONTINUED)
-
-
-@pytest.fixture
-def runs(processes):
-    """The recorded runs, each with its world model."""
-    for name in NAMES:
-        shutil.copytree(FIXTURES / "runs" / name, processes.runs / name)
-        shutil.copyfile(FIXTURES / "small.zip", processes.runs / name / "bundle.zip")
-    return processes.runs
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -4,10 +4,7 @@ import json
 import os
 import shutil
 import socket
-import sqlite3
-import subprocess
 import sys
-from contextlib import closing
 from dataclasses import replace
 from importlib.metadata import entry_points
 
@@ -22,10 +19,12 @@ from dreamfleet.common.cli import command_line
 from dreamfleet.common.runs.episode_results import EpisodeResult
 from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
 from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
-from tests.support.processes import DEADLINE, ROOT, command
+from tests.support.journals import change_journal
+from tests.support.processes import ROOT, call_here
 
 MARK = "foreign_marker"  # the module that nobody named
 FIXTURES = ROOT / "tests" / "fixtures"
+DRIVES = EpisodeResult(5000, 1.0, 1), EpisodeResult(5001, 2.0, 1)
 OWN, GYM = f"{MARK}:World", f"gym:{MARK}:X-v0"
 # Verbs that read no file, journal, message or report of somebody else in which a task or an optimiser has a name.
 NAMELESS = {
@@ -60,7 +59,9 @@ def folder(tmp_path, monkeypatch, mark):
     for name, task in (("own", OWN), ("gym", GYM)):
         manifest = replace(small.manifest, task=task)
         bundle = write_bundle(tmp_path / f"{name}-bundle.zip", manifest, parts)
-        write_controller(tmp_path / f"{name}.npz", task)
+        controller = write_controller(tmp_path / f"{name}.npz", task)
+        report = EvaluationReport(f"{name}.npz", controller.sha256, task, task, "", "f", "1", 1.0, DRIVES)
+        (tmp_path / f"{name}.json").write_text(report.to_json())
         write_controller(tmp_path / f"{name}-seen" / "controller.npz", "car-racing", bundle)
         write_controller(tmp_path / f"{name}-dreamt" / "controller.npz", "dream", bundle)
         write_run(tmp_path / "runs" / name, bundle, task=task)
@@ -71,7 +72,6 @@ def folder(tmp_path, monkeypatch, mark):
     graph = GraphBuilder("agent")
     graph.add_output(graph.node("Identity", graph.constant(np.zeros((1, 1), np.float32))), "worth", 1, 1)
     TrainedAgent(agent, graph.build()).save(tmp_path / "agent.zip")
-    write_reports(tmp_path)
     command_line.main(["collect", "--data", "data", "--episodes", "2", "--steps", "5", "--jobs", "1"])
     return tmp_path
 
@@ -86,32 +86,24 @@ def write_controller(path, task, bundle=None, options=None):
     ).save(path)
     if bundle:
         shutil.copy(bundle.path, path.parent / "bundle.zip")
+    return Controller.load(path)
 
 
 def write_run(folder, bundle, **names):
     """The folder of a run of the dream whose journal names others."""
     shutil.copytree(FIXTURES / "runs" / "dream", folder)
     shutil.copy(bundle.path, folder / "bundle.zip")
-    with closing(sqlite3.connect(folder / "journal.sqlite")) as journal, journal:
-        (text,) = journal.execute("SELECT value FROM run WHERE key = 'settings'").fetchone()
-        settings = json.loads(text)
-        task = {name: value for name, value in names.items() if name == "task"}
-        settings |= names | {"task": settings["task"] | {"bundle": bundle.sha256} | task}
-        journal.execute("UPDATE run SET value = ? WHERE key = 'settings'", (json.dumps(settings),))
-        journal.execute("DELETE FROM run WHERE key = 'ended'")
+    ((text,),) = change_journal(folder, "SELECT value FROM run WHERE key = 'settings'")
+    settings = json.loads(text)
+    task = {name: value for name, value in names.items() if name == "task"}
+    settings |= names | {"task": settings["task"] | {"bundle": bundle.sha256} | task}
+    change_journal(folder, "UPDATE run SET value = ? WHERE key = 'settings'", json.dumps(settings))
+    change_journal(folder, "DELETE FROM run WHERE key = 'ended'")
     kept = Controller.load(folder / "controller.npz")
     provenance = kept.provenance | {"settings": settings}
     replace(kept, task=settings["task"]["task"], bundle=bundle.sha256, provenance=provenance).save(
         folder / "controller.npz"
     )
-
-
-def write_reports(folder):
-    drives = EpisodeResult(5000, 1.0, 1), EpisodeResult(5001, 2.0, 1)
-    for name, task in (("own", OWN), ("gym", GYM)):
-        controller = Controller.load(folder / f"{name}.npz")
-        report = EvaluationReport(f"{name}.npz", controller.sha256, task, task, "", "f", "1", 1.0, drives)
-        (folder / f"{name}.json").write_text(report.to_json())
 
 
 CONTROLLERS = ["own.npz", "gym.npz", "nested.npz"]
@@ -183,24 +175,19 @@ def test_every_verb_is_tried_or_reads_no_names():
     assert tried | NAMELESS == {each.name for each in entry_points(group=command_line.GROUP)}
 
 
-def call(words, capfd):
+def call(words, processes):
     """The exit code and stderr of a verb; one that serves a run changes the process, so it gets its own."""
-    if words[0] == "coordinator" or words[:2] == ("verify", "run"):
-        done = subprocess.run(command(*words), capture_output=True, text=True, timeout=DEADLINE, check=False)
-        return done.returncode, done.stderr
-    try:
-        code = command_line.main(list(words))
-    except SystemExit as error:
-        code = error.code
-    return code, capfd.readouterr().err
+    serves = words[0] == "coordinator" or words[:2] == ("verify", "run")
+    code, _, err = (processes.call if serves else call_here)(*words)
+    return code, err
 
 
 @pytest.mark.long
-def test_no_verb_imports_what_a_file_names(folder, mark, capfd):
+def test_no_verb_imports_what_a_file_names(folder, mark, processes):
     refused = set()
     with socket.create_server(("127.0.0.1", 0)) as busy:
         for words in commands(busy.getsockname()[1]):
-            code, said = call(words, capfd)
+            code, said = call(words, processes)
             assert not mark.exists(), words
             assert "Traceback" not in said, (words, said)
             if f"--trust {MARK}" in said:
@@ -213,11 +200,10 @@ def test_no_verb_imports_what_a_file_names(folder, mark, capfd):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("file", "task"), [("own.npz", OWN), ("gym.npz", GYM)])
-def test_what_the_user_names_is_imported(folder, mark, capfd, file, task):
+def test_what_the_user_names_is_imported(folder, mark, file, task):
     words = ["evaluate", "--controller", file, "--episodes", "1", "--jobs", "1"]
-    assert command_line.main(words) == 2
-    assert f"--trust {MARK}" in (said := capfd.readouterr().err)
-    assert said.count("\n") == 1
+    code, _, err = call_here(*words)
+    assert (code, f"--trust {MARK}" in err, err.count("\n")) == (2, True, 1), err
     assert not mark.exists()
-    assert command_line.main([*words, "--trust", MARK]) == 2  # it has no such world
+    assert call_here(*words, "--trust", MARK)[0] == 2  # it has no such world
     assert mark.exists()

@@ -11,6 +11,7 @@ import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support import disks, tasks
+from tests.support.same_bits import evolve
 
 DRIVES, GENERATIONS = 30, 40
 FILE_CHECK = 1.0  # seconds between two looks at the files
@@ -57,9 +58,7 @@ def test_a_run_on_a_full_disk_waits_and_goes_on_by_itself_to_the_same_bits(proce
     worker.end()
     found = history(small_disk)
     processes.runs = processes.folder / "roomy"
-    whole = processes.coordinator(*fast)
-    processes.worker("--task", tasks.TOY)
-    assert whole.finish()[0] == 0
+    evolve(processes, "test", 1, *fast, task=tasks.TOY)
     assert found == history(processes.runs)
 
 

@@ -16,7 +16,7 @@ from dreamfleet.coordinator.addons.runs.export import scalars_of
 from dreamfleet.coordinator.service.status import encode_part
 from tests.support import tasks
 from tests.support.events import scalars
-from tests.support.processes import call_here
+from tests.support.processes import call_here, printed, refused
 from tests.support.served import snapshot
 
 
@@ -45,8 +45,7 @@ def test_an_orderly_end_is_not_logged_as_a_loss(processes, small):
     coordinator.wait_for_event("generation", number=0)
     drained.popen.terminate()
     assert coordinator.wait_for_event("left")["worker"].startswith("drained/")
-    code, out, err = call_here("status", "test", "--connect", processes.endpoint)
-    assert (code, "╭─ test · " in out) == (0, True), err
+    assert "╭─ test · " in printed("status", "test", "--connect", processes.endpoint)
     for verb, event in (("pause", "paused"), ("resume", "resumed"), ("stop", None)):
         assert processes.call(verb, "test", "--connect", processes.endpoint)[0] == 0
         if event:
@@ -63,10 +62,10 @@ def test_the_events_of_a_killed_workers_jobs_are_printed_while_the_run_lives(pro
     worker.popen.kill()
     assert coordinator.wait_for_event("lost")["worker"].startswith("host-a/")
 
+    of_it = ("story", "test", "--connect", processes.endpoint)
+
     def story(*words):
-        code, out, err = call_here("story", "test", "--connect", processes.endpoint, *words, "--json")
-        assert code == 0, err
-        return json.loads(out)
+        return json.loads(printed(*of_it, *words, "--json"))
 
     while "lost" not in (whats := [each["what"] for each in story("--worker", "host-a")]):
         pass  # a snapshot is a fifth of a second old
@@ -74,11 +73,10 @@ def test_the_events_of_a_killed_workers_jobs_are_printed_while_the_run_lives(pro
     assert {"given", "accepted", "reissued"} <= set(whats)
     assert {each["job"].split("/")[1] for each in story("--job", "0/3")} == {"3"}
     assert len(story("--last", "3")) == 3
-    code, out, err = call_here("story", "test", "--connect", processes.endpoint, "--last", "2")
+    code, out, err = call_here(*of_it, "--last", "2")
     assert (code, len(out.splitlines()), " 2 " in err) == (0, 3, True), err
-    code, _, err = call_here("story", "test", "--connect", processes.endpoint, "--job", "three")
-    assert (code, "--job" in err) == (2, True)
-    code, _, err = call_here("story", "test", "--connect", processes.endpoint, "--worker", "host-b")
+    refused("--job", *of_it, "--job", "three")
+    code, _, err = call_here(*of_it, "--worker", "host-b")
     assert (code, "'host-b'" in err, "host-a" in err) == (2, True, True), err
 
 
@@ -89,8 +87,7 @@ def test_a_coordinator_that_answers_with_its_status_alone_is_not_called_absent(p
         key = keys.status("night")
         session.declare_queryable(key, lambda query: query.reply(key, status))
         for run in ((), ("night",)):
-            code, _, err = call_here("story", *run, "--connect", processes.endpoint)
-            assert (code, "night" in err) == (1, True), err
+            refused("night", "story", *run, "--connect", processes.endpoint, code=1)
     code, _, err = call_here("story", "night", "--connect", processes.endpoint)
     assert (code, "night" in err) == (1, False), err
 
@@ -106,8 +103,7 @@ def test_curves_go_on_after_a_kill_and_stall_nothing(processes, small, monkeypat
     for _ in range(2):
         while not any(len(points) > 3 for points in scalars(board).values()):
             life.wait_for_event("generation")
-        os.kill(life.popen.pid, signal.SIGKILL)
-        life.popen.wait()
+        life.end()
         life = processes.resume()
     life.wait_for_event("generation", times=3)
     life.popen.send_signal(signal.SIGTERM)

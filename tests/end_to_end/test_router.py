@@ -2,7 +2,6 @@
 Tests common/addons/router/verb.py."""
 
 import json
-import os
 import signal
 import tomllib
 from pathlib import Path
@@ -13,7 +12,7 @@ import zenoh
 from tests.support import tasks
 from tests.support.hosts import new_host, require_hosts
 from tests.support.processes import free_port, processes_in
-from tests.support.same_bits import outcome
+from tests.support.same_bits import evolve, outcome
 
 ANY = "0.0.0.0:7447"
 RECIPES = Path(__file__).parents[2] / "deploy" / "zenoh"
@@ -43,10 +42,7 @@ def settings(small):
 def alone(tmp_path_factory, settings):
     """What the run comes to where nothing stands between."""
     with processes_in(tmp_path_factory.mktemp("alone")) as processes:
-        coordinator = processes.coordinator(*settings, "--task", tasks.TOY, name="alone")
-        processes.worker("--run", "alone", "--task", tasks.TOY)
-        assert coordinator.finish()[0] == 0
-        return outcome(processes, "alone")
+        return evolve(processes, "alone", 1, *settings, "--task", tasks.TOY, task=tasks.TOY)
 
 
 @pytest.mark.slow
@@ -62,8 +58,7 @@ def test_two_linked_routers_one_of_which_is_killed_cost_no_bit(processes, recipe
     worker = processes.start("worker", "--config", second, "--run", "far", "--task", tasks.SLOW_TOY, "--slots", 1)
     worker.wait_for_event("joined")
     coordinator.wait_for_event("generation", number=1)
-    os.kill(router.popen.pid, signal.SIGKILL)
-    router.popen.wait()
+    router.end()
     processes.start("router", "--config", first).wait_for_event("begin")
     assert coordinator.finish()[0] == 0
     linked.popen.send_signal(signal.SIGTERM)
@@ -96,8 +91,7 @@ def test_a_coordinator_that_nobody_reaches_meets_workers_of_another_network_at_a
 
 @pytest.mark.parametrize("name", ["one.toml", "linked.toml"])
 def test_what_is_printed_for_zenohd_is_the_routers_own_configuration(processes, name):
-    code, out, err = processes.call("router", "--config", RECIPES / name, "--print-config")
-    assert code == 0, err
+    out = processes.printed("router", "--config", RECIPES / name, "--print-config")
     config, wanted = json.loads(out), tomllib.loads((RECIPES / name).read_text())["router"]
     assert config["mode"] == "router"
     assert (config["listen"]["endpoints"], config["connect"]["endpoints"]) == (

@@ -20,7 +20,8 @@ from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.transport.session import Network, open_session
 from dreamfleet.coordinator.settings.start import latest_mean_and_sigma
 from tests.support import tasks
-from tests.support.processes import DEADLINE, ROOT, call_here, free_port, until
+from tests.support.processes import DEADLINE, ROOT, call_here, free_port, printed, until
+from tests.support.same_bits import evolve
 
 OWN = "tests.support.optimisers:ParentsAndChildren"
 
@@ -38,12 +39,10 @@ def test_a_worker_that_started_first_waits_fetches_the_bundle_and_leaves_when_th
 
 
 def test_the_mean_is_evaluated_on_schedule_and_at_the_end_and_the_target_ends_the_run(processes, small):
-    coordinator = processes.coordinator(
-        *small, "--task", tasks.TOY, "--population", 8, "--sigma0", 0.2, "--evaluate-every", 5,
-        "--evaluation-episodes", 3, "--generations", 400, "--target", -4,
+    evolve(
+        processes, "test", 1, *small, "--task", tasks.TOY, "--population", 8, "--sigma0", 0.2, "--evaluate-every", 5,
+        "--evaluation-episodes", 3, "--generations", 400, "--target", -4, task=tasks.TOY,
     )  # fmt: skip
-    processes.worker("--task", tasks.TOY)
-    assert coordinator.finish()[0] == 0
     with open_run(processes.runs, "test") as run:
         evaluations = run.evaluations()
         assert [each.generation % 5 for each in evaluations[:-1]] == [4] * (len(evaluations) - 1)
@@ -97,9 +96,7 @@ def test_pause_resume_and_drain_from_the_command_line(processes, small):
     coordinator.wait_for_event("generation", number=0)
 
     def say(*words):
-        code, out, err = processes.call(*words, "--connect", processes.endpoint)
-        assert code == 0, err
-        return out
+        return processes.printed(*words, "--connect", processes.endpoint)
 
     assert json.loads(say("pause", "--json")) == {"run": "test", "asked": "pause", "accepted": True}
     assert processes.status()["state"] == "paused"
@@ -118,9 +115,7 @@ def test_pause_resume_and_drain_from_the_command_line(processes, small):
 @pytest.mark.slow
 def test_a_fork_begins_where_its_run_was_and_may_change_what_is_frozen(processes, small):
     toy = (*small, "--task", tasks.TOY)
-    first = processes.coordinator(*toy, "--generations", 3)
-    processes.worker("--task", tasks.TOY, "--exit-when-done")
-    assert first.finish()[0] == 0
+    evolve(processes, "test", 1, *toy, "--generations", 3, task=tasks.TOY)
     own = ("--optimiser", OWN, "--optimiser-options", "parents=1")
     fork = processes.fork("test", "--population", 6, *own, "--generations", 1)
     processes.worker("--task", tasks.TOY, "--run", "test-fork")
@@ -207,30 +202,24 @@ POPULATION = 6
 
 @pytest.mark.slow
 def test_the_elites_of_a_run_are_shown_drawn_judged_and_exported(processes, small):
-    coordinator = processes.coordinator(
-        *small, "--task", tasks.TOY, "--population", POPULATION, "--episodes", 2, "--sigma0", 0.2, "--generations", 5,
-        "--archive", *AXES, "--optimiser", "map-elites",
+    evolve(
+        processes, "test", 1, *small, "--task", tasks.TOY, "--population", POPULATION, "--episodes", 2,
+        "--sigma0", 0.2, "--generations", 5, "--archive", *AXES, "--optimiser", "map-elites", task=tasks.TOY,
     )  # fmt: skip
-    processes.worker("--task", tasks.TOY)
-    assert coordinator.finish()[0] == 0
     with open_run(processes.runs, "test") as run:
         vectors = np.stack([run.candidate(each.number, i) for each in run.history() for i in range(POPULATION)])
         archive = RunArchive.of(run)
         assert len(run.measured_candidates()) == 5 * POPULATION
 
-    def call(*words):
-        code, out, err = call_here(*words, "--runs-dir", processes.runs)
-        assert code == 0, err
-        return out, err
-
-    facts = json.loads(call("runs", "show", "test", "--json")[0])["archive"]
+    runs = ("--runs-dir", processes.runs)
+    facts = json.loads(printed("runs", "show", "test", *runs, "--json"))["archive"]
     assert (facts["cells"], facts["filled"]) == (36, len(archive.elites))
     assert facts["best"]["fitness"] == archive.best.fitness
     cell = ",".join(map(str, archive.best.cell))
-    _, note = call("evaluate", "--controller", "test", "--cell", cell, "--episodes", 1)
-    assert archive.describe_elite(archive.best) in note
+    code, _, err = call_here("evaluate", "--controller", "test", *runs, "--cell", cell, "--episodes", 1)
+    assert (code, archive.describe_elite(archive.best) in err) == (0, True), err
     picture, folder = processes.folder / "archive.svg", processes.folder / "tables"
-    call("runs", "plot", "test", "--kind", "archive", "--out", picture)
+    printed("runs", "plot", "test", *runs, "--kind", "archive", "--out", picture)
     assert picture.stat().st_size > 5_000
     with dreamfleet.open_run("test", processes.runs) as run:
         frame, figure = run.to_pandas("elites"), run.plot("archive")
@@ -240,21 +229,7 @@ def test_the_elites_of_a_run_are_shown_drawn_judged_and_exported(processes, smal
     numbers = [[label.get_text() for label in each.get_xticklabels()] for each in (axes, axes.child_axes[0])]
     assert numbers == [["-0.5", "-0.333", "-0.167", "0", "0.167", "0.333", "0.5"], ["0", "1", "2", "3", "4", "5"]]
     assert f"--cell {cell}" in axes.get_title().replace("\n", " ")
-    call("runs", "export", "test", "--csv", "--out", folder)
+    printed("runs", "export", "test", *runs, "--csv", "--out", folder)
     with np.load(folder / "elites.npz") as elites:
         parameters = elites["parameters"][np.argmax(elites["fitness"])]
     assert np.array_equal(parameters, vectors[archive.best.generation * POPULATION + archive.best.candidate])
-
-
-def test_an_archive_that_cannot_be_is_refused_before_there_is_a_run(processes):
-    for arguments, says in (
-        (("--optimiser", "cma-me"), "--archive"),
-        (("--archive", "steps=5"), "'steps=5'"),
-        (("--archive", "steps=0:9:9", "steps=0:9:9"), "--archive"),
-        (("--archive", "steps=0:1:200", "gas=0:1:200"), "40,000"),
-        (("--task", "dream", "--archive", "truth.speed=0:1:9"), "truth.speed"),
-    ):
-        code, _, err = call_here("coordinator", "--runs-dir", processes.runs, *arguments)
-        assert code == 2, arguments
-        assert says in err.strip().splitlines()[-1]
-        assert not processes.runs.exists() or not any(processes.runs.iterdir())

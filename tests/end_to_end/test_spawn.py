@@ -15,9 +15,9 @@ from dreamfleet.common.addons.access.authority import Authority
 from dreamfleet.coordinator.addons.spawn.agent import process_start
 from tests.support import tasks
 from tests.support.disks import small_disk
-from tests.support.processes import DEADLINE, until
+from tests.support.processes import DEADLINE, free_port, until
 from tests.support.programs import find_program
-from tests.support.sshd import closed_port, new_key
+from tests.support.sshd import new_key
 
 TOY = ("--task", tasks.TOY, "--population", 4, "--episodes", 1, "--evaluate-every", 0)
 
@@ -145,7 +145,7 @@ def mute():
 def test_each_thing_that_stands_in_the_way_is_said_and_the_others_come_up(processes, hosts, mute, tmp_path):
     for name in ("good", "changed", "strange", "locked", "bare"):
         hosts.add(name, **({"path": "/nowhere"} if name == "bare" else {}))
-    hosts.write(refused=("127.0.0.1", closed_port()), lost=("host.invalid", 22), mute=mute.getsockname())
+    hosts.write(refused=("127.0.0.1", free_port()), lost=("host.invalid", 22), mute=mute.getsockname())
     foreign = new_key(tmp_path / "foreign")
     stranger = hosts.config_with(foreign)
     keys = hosts.known.read_text().splitlines()

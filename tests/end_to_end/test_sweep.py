@@ -17,6 +17,7 @@ from dreamfleet.coordinator.run.recall import bar_stored
 from dreamfleet.experiments.sweep import runner
 from tests.support import tasks
 from tests.support.processes import ROOT, call_here, until
+from tests.support.same_bits import evolve
 
 FLEET = ("--parallel", 3, "--workers", 2)
 
@@ -45,13 +46,10 @@ def test_a_sweep_compares_settings_and_each_run_has_the_bits_that_it_has_alone(p
     assert all(each["error"] is not None for each in answer["settings"])
     assert {each["state"] for each in answer["runs"]} == {"finished"}
     assert (processes.runs / "toys.sweep" / "learning.png").stat().st_size > 1000
-    coordinator = processes.coordinator(*small, "--generations", 2, "--seed", 2, "--sigma0", 0.1, name="alone")
-    processes.worker("--task", tasks.SLOW_TOY)
-    assert coordinator.finish()[0] == 0
+    evolve(processes, "alone", 1, *small, "--generations", 2, "--seed", 2, "--sigma0", 0.1, task=tasks.SLOW_TOY)
     assert journal(processes.runs, "alone") == journal(processes.runs, "toys-seed2-sigma0-0-1")
     runs = ("--runs-dir", processes.runs)
-    code, out, _ = processes.call("sweep", "--resume", "toys", *runs, "--json")
-    assert (code, json.loads(out)["settings"]) == (0, answer["settings"])
+    assert json.loads(processes.printed("sweep", "--resume", "toys", *runs, "--json"))["settings"] == answer["settings"]
     listed = json.loads(call_here("runs", "list", *runs, "--json")[1])
     assert [each["run"] for each in listed if each["sweep"] != "toys"] == ["alone"]
     assert json.loads(call_here("compare", "toys", *runs, "--json")[1])["settings"] == answer["settings"]

@@ -8,8 +8,8 @@ import pytest
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support import checkpoint_files
-from tests.support.processes import call_here
-from tests.support.same_bits import evolve
+from tests.support.processes import printed
+from tests.support.same_bits import check_replay, evolve
 
 HORIZON = 30
 RUNS = {
@@ -38,8 +38,7 @@ def test_a_run_evolves_and_is_replayed_to_the_same_bits(processes, driven, kind)
         assert {each.steps for each in run.results(1, 2)} == {HORIZON}
         controller = Controller.load(run.controller_path)
         assert controller.options == run.spec.options != ""
-    code, out, err = call_here("verify", "candidate", "one", "--runs-dir", processes.runs, "--candidate", "1/2")
-    assert (code, out.count("same bits")) == (0, 1), err
+    check_replay(processes, "one", "1/2", 1)
 
 
 @pytest.mark.slow
@@ -47,20 +46,14 @@ def test_every_verb_drives_as_the_run_does(processes, driven):
     variant = ("--variant", "pedals=one", "decide_every=3", "feedback=last")
     evolve(processes, "one", 1, *driven, *variant, "--collect-every", 1, "--collect-episodes", 1)
     runs = ("--runs-dir", processes.runs)
-    code, out, err = call_here("verify", "candidate", "one", *runs, "--candidate", "1/2")
-    assert (code, out.count("same bits")) == (0, 1), err
-    code, out, err = call_here("runs", "show", "one", *runs)
-    assert '"decide_every": 3' in out, err
-    code, out, err = call_here("evaluate", "--controller", "one", *runs, "--episodes", 2, "--jobs", 2)
-    assert code == 0, err
+    check_replay(processes, "one", "1/2", 1)
+    assert '"decide_every": 3' in printed("runs", "show", "one", *runs)
+    printed("evaluate", "--controller", "one", *runs, "--episodes", 2, "--jobs", 2)
     video = processes.folder / "drive.mp4"
-    code, out, err = processes.call("record", "--controller", "one", *runs, "--out", video, "--steps", 8)
-    assert code == 0, err
+    processes.printed("record", "--controller", "one", *runs, "--out", video, "--steps", 8)
     assert video.stat().st_size > 1000
-    code, out, err = processes.call("inspect", "one", *runs, "--out", processes.folder / "page", "--steps", 20)
-    assert code == 0, err
-    code, out, err = processes.call("collect", "--data", processes.folder / "data", "--from-run", "one", *runs)
-    assert code == 0, err
+    processes.printed("inspect", "one", *runs, "--out", processes.folder / "page", "--steps", 20)
+    processes.printed("collect", "--data", processes.folder / "data", "--from-run", "one", *runs)
     for path in (processes.folder / "data" / "episodes").iterdir():
         with np.load(path) as drive:
             steps = drive["action"][: HORIZON // 3 * 3].reshape(-1, 3, 3)
@@ -74,17 +67,12 @@ def test_a_run_goes_on_from_a_controller_of_ctallec(processes, tmp_path):
     checkpoint_files.write_checkpoints(imported, checkpoint_files.random_weights())
     world, controller = tmp_path / "world.zip", tmp_path / "controller.npz"
     for command in ((imported, "--out", world), (imported / "ctrl", "--bundle", world, "--out", controller)):
-        found = processes.call("import", *command)
-        assert found[0] == 0, found
+        processes.printed("import", *command)
     few = ("--population", 4, "--episodes", 1, "--horizon", 5, "--evaluate-every", 0, "--generations", 1)
-    coordinator = processes.coordinator("--bundle", world, "--init", controller, *few)
-    processes.worker("--exit-when-done")
-    assert coordinator.finish()[0] == 0
+    evolve(processes, "test", 1, "--bundle", world, "--init", controller, *few)
     with open_run(processes.runs, "test") as run:
         evolved = Controller.load(run.controller_path)
     assert evolved.variant.actions == "linear"
-    replayed = processes.call("verify", "candidate", "test", "--candidate", "0/1", "--runs-dir", processes.runs)
-    assert replayed[0] == 0, replayed
-    judged = processes.call("evaluate", "--controller", controller, "--bundle", world, "--episodes", 1, "--json")
-    assert judged[0] == 0, judged
-    assert isinstance(json.loads(judged[1])["mean"], float), judged
+    check_replay(processes, "test", "0/1", 1)
+    judged = processes.printed("evaluate", "--controller", controller, "--bundle", world, "--episodes", 1, "--json")
+    assert isinstance(json.loads(judged)["mean"], float), judged

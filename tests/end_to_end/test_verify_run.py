@@ -17,6 +17,7 @@ from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.common.runs.run_provenance import read_run_provenance
 from tests.support import tasks
 from tests.support.processes import DEADLINE, ROOT
+from tests.support.same_bits import evolve
 
 STAGES = """
 [[stage]]
@@ -38,13 +39,11 @@ def test_a_run_of_two_stages_from_a_controller_is_repeated_through_a_kill_and_a_
     shape = random_bundle.controller_shape
     start = np.linspace(-1, 1, shape.size, dtype=np.float32)
     Controller(shape, start, tasks.TOY, random_bundle.sha256).save(tmp_path / "start.npz")
-    coordinator = processes.coordinator(
-        *small, "--task", tasks.TOY, "--population", 5, "--episodes", 2, "--evaluate-every", 2, "--evaluation-episodes",
-        3, "--confirm-episodes", 4, "--steps", 400, "--schedule", tmp_path / "stages.toml", "--init",
-        tmp_path / "start.npz", name="first",
+    evolve(
+        processes, "first", 1, *small, "--task", tasks.TOY, "--population", 5, "--episodes", 2, "--evaluate-every", 2,
+        "--evaluation-episodes", 3, "--confirm-episodes", 4, "--steps", 400, "--schedule", tmp_path / "stages.toml",
+        "--init", tmp_path / "start.npz", task=tasks.TOY,
     )  # fmt: skip
-    processes.worker("--task", tasks.TOY, "--run", "first", "--exit-when-done")
-    assert coordinator.finish()[0] == 0
     first = tmp_path / "kept.npz"
     (processes.runs / "first" / CONTROLLER).rename(first)
     (tmp_path / "start.npz").unlink()

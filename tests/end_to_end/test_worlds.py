@@ -8,9 +8,10 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.runs.run_folder import open_run
 from tests.support.dreams import write_bundle_of
 from tests.support.pixel_world import DODGE, DODGE_TASK, MODULE
-from tests.support.same_bits import evolve
+from tests.support.same_bits import check_replay, evolve
 
 EPISODES = 2
+TRUSTED = ("--trust", MODULE)
 
 
 @pytest.mark.slow
@@ -25,11 +26,8 @@ def test_a_run_dreams_in_a_bundles_world_and_is_replayed_to_the_same_bits(proces
     with open_run(processes.runs, "own") as run:
         assert (run.spec.end, run.spec.version) == ("0.999", 11)
         assert (run.spec.task, run.settings.controller.actions) == ("dream", 3)
-    runs = ("--runs-dir", processes.runs)
-    code, out, err = processes.call("verify", "candidate", "own", *runs, "--candidate", "1/2", "--trust", MODULE)
-    assert (code, out.count("same bits")) == (0, EPISODES), err
-    code, _, err = processes.call("evaluate", "--controller", "own", *runs, "--episodes", 1, "--trust", MODULE)
-    assert code == 0, err
+    check_replay(processes, "own", "1/2", EPISODES, *TRUSTED, call=processes.call)
+    processes.printed("evaluate", "--controller", "own", "--runs-dir", processes.runs, "--episodes", 1, *TRUSTED)
 
 
 SMALL = {
@@ -39,15 +37,12 @@ SMALL = {
 }
 LAYERS = tuple(word for name, text in SMALL.items() for word in (f"--{name}-flags", text))
 SHORT = "--generations 2 --population 4 --episodes 1 --horizon 20 --evaluate-every 1 --evaluation-episodes 1"
-TRUSTED = ("--trust", MODULE)
 
 
 @pytest.mark.slow
 def test_a_gymnasium_world_goes_from_drives_to_a_video(processes, tmp_path):
     def call(*words):
-        code, out, err = processes.call(*words, *TRUSTED)
-        assert code == 0, err
-        return out
+        return processes.printed(*words, *TRUSTED)
 
     data, film = tmp_path / "data", tmp_path / "drive.mp4"
     made = call("pipeline", "--data", data, "--task", DODGE, "--scale", "0.02", "--jobs", 1, *LAYERS, "--yes",
@@ -57,9 +52,7 @@ def test_a_gymnasium_world_goes_from_drives_to_a_video(processes, tmp_path):
     facts = bundle.manifest.world
     assert (bundle.manifest.task, facts.reward.source, facts.end.at) == (DODGE, "survival", 0.9)
     words = (*SHORT.split(), "--preset", "pixels", "--confirm-episodes", 0, "--bundle", bundle.path)
-    coordinator = processes.coordinator(*words, name="dodge")
-    processes.worker("--run", "dodge", "--task", DODGE)
-    assert coordinator.finish()[0] == 0, coordinator.lines
+    evolve(processes, "dodge", 1, *words, task=DODGE)
     run = ("--controller", "dodge", "--runs-dir", processes.runs)
     judged = json.loads(call("evaluate", *run, "--episodes", 2, "--jobs", 1, "--json"))
     assert (judged["world"], len(judged["drives"])) == (DODGE, 2)
@@ -74,12 +67,11 @@ def test_a_gymnasium_world_goes_from_drives_to_a_video(processes, tmp_path):
 @pytest.mark.long
 def test_rounds_of_a_gymnasium_world_learn_from_drives_of_its_own_controllers(processes):
     data = processes.folder / "data"
-    code, out, err = processes.call(
+    out = processes.printed(
         "iterate", "--data", data, "--task", DODGE, "--rounds", 2, "--drives", 6, "--own-drives", 2, "--means", 1,
         *LAYERS, "--vae-updates", 2, "--mdnrnn-updates", 2, "--gate-lives", 4, "--gate-drives", 0, "--gate-losses", 0,
         "--run-flags", f"{SHORT} --confirm-episodes 0", "--jobs", 1, "--local", 1, *TRUSTED, "--json",
     )  # fmt: skip
-    assert code == 0, err
     rounds = json.loads(out)["rounds"]
     assert [each["drives"] for each in rounds] == [6, 8]
     for number in (1, 2):

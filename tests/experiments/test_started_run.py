@@ -8,7 +8,7 @@ import subprocess
 import sys
 import uuid
 from contextlib import ExitStack, nullcontext
-from types import SimpleNamespace
+from unittest.mock import Mock, PropertyMock
 
 import psutil
 import pytest
@@ -73,25 +73,15 @@ def test_generations_come_as_they_close_and_the_journal_stays(alive, tmp_path):
     assert evolve(resume="pole", workers=1, runs_dir=tmp_path).ended == "42 generations"  # nothing was left to do
 
 
-def leave(_generation, _run):
-    return False
-
-
-def fail(_generation, _run):
-    raise LookupError("of the callback")
-
-
-def interrupt(_generation, _run):
-    signal.raise_signal(signal.SIGINT)
-
-
-def end(_generation, run):
-    run.end()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("callback", "error"), [(leave, None), (end, None), (fail, LookupError), (interrupt, KeyboardInterrupt)]
+    ("callback", "error"),
+    [
+        (lambda *_: False, None),
+        (lambda _generation, run: run.end(), None),
+        (lambda *_: {}["of the callback"], LookupError),
+        (lambda *_: signal.raise_signal(signal.SIGINT), KeyboardInterrupt),
+    ],
 )
 def test_a_run_that_is_left_early_ends_its_processes_and_stays_open(alive, tmp_path, callback, error):
     with nullcontext() if error is None else pytest.raises(error):
@@ -150,26 +140,12 @@ def test_a_run_goes_on_while_one_of_its_own_workers_may_score(tmp_path):
         assert any(each.number > closed for each in run)
 
 
-class Leaving:
-    """The processes of a run that has ended: the coordinator exits, and its worker did not do so in time."""
-
-    def __init__(self):
-        self.codes = iter((None, 0))
-
-    @property
-    def coordinator(self):
-        return SimpleNamespace(exit_code=next(self.codes))
-
-    def check_workers(self):
-        raise DreamfleetError("killed by signal 14")
-
-    def check_end(self):
-        pass
-
-
 def test_a_worker_that_is_killed_as_it_leaves_an_ended_run_is_no_error(tmp_path):
     shutil.copytree(ROOT / "tests" / "fixtures" / "runs" / "reality", tmp_path / "reality")
-    with StartedRun(tmp_path / "reality", Leaving(), "", None, resumed=False) as run:
+    leaving = Mock()  # the coordinator exits, and its worker did not do so in time
+    type(leaving.coordinator).exit_code = PropertyMock(side_effect=(None, 0))
+    leaving.check_workers.side_effect = DreamfleetError("killed by signal 14")
+    with StartedRun(tmp_path / "reality", leaving, "", None, resumed=False) as run:
         run.end_with(ExitStack())
         assert [each.number for each in run] == [0, 1, 2]
 
@@ -237,16 +213,7 @@ def test_a_world_model_chooses_no_code_of_the_workers(alive, tmp_path, random_bu
     wanted = b'"gym:strangers_choice:Env-v0"'
     rewrite(path, lambda name, data: data.replace(f'"{task}"'.encode(), wanted) if name == MANIFEST else data)
     with pytest.raises(UsageError, match="--trust strangers_choice"):
-        start_run(
-            task="dream",
-            evaluate_every=0,
-            bundle=path,
-            population=3,
-            episodes=1,
-            generations=1,
-            workers=1,
-            runs_dir=tmp_path / "runs",
-        )
+        start_run(bundle=path, generations=1, runs_dir=tmp_path / "runs", **{**SMALL, "task": "dream"})
     assert not alive()
 
 

@@ -36,39 +36,22 @@ def test_verbs_take_empty_values(stage):
     assert [(call.argv, found) for call, found in run_calls(calls, stage, 2, LIMIT) if found] == []
 
 
-def fail(_words):
-    raise RuntimeError("a bug")
-
-
-def hang(_words):
-    time.sleep(300)
-
-
-def end_by_a_signal(_words):
-    os.kill(os.getpid(), signal.SIGUSR1)
-
-
-def print_usage(_words):
-    sys.stderr.write("usage\n" * 7)
-    return 2
-
-
 @pytest.mark.parametrize(
-    ("bug", "found"),
+    ("bug", "limit", "found"),
     [
-        (fail, "Traceback"),
-        (end_by_a_signal, f"ended by signal {signal.SIGUSR1:d}"),
-        (print_usage, "7 lines on stderr"),
-        (lambda _words: 3, "exit code 3"),
-        (lambda _words: 0, ""),
-        (hang, "Traceback"),
+        (lambda _words: 1 // 0, LIMIT, "Traceback"),
+        (lambda _words: os.kill(os.getpid(), signal.SIGUSR1), LIMIT, f"ended by signal {signal.SIGUSR1:d}"),
+        (lambda _words: sys.stderr.write("usage\n" * 7) and 2, LIMIT, "7 lines on stderr"),
+        (lambda _words: 3, LIMIT, "exit code 3"),
+        (lambda _words: 0, LIMIT, ""),
+        (lambda _words: time.sleep(300), 1.0, "Traceback"),
     ],
 )
-def test_it_sees_what_it_is_there_to_find(bug, found, tmp_path, monkeypatch):
+def test_it_sees_what_it_is_there_to_find(bug, limit, found, tmp_path, monkeypatch):
     monkeypatch.setattr(command_line, "main", bug)
     for name in ("work", "home", "tmp"):
         (tmp_path / name).mkdir()
-    child = start([], tmp_path, 1.0 if bug is hang else LIMIT)
+    child = start([], tmp_path, limit)
     while (complaint := child.poll()) is None:
         time.sleep(0.01)
     assert found in complaint

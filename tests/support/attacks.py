@@ -10,7 +10,6 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
 import msgspec
-import zenoh
 
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.codec import decode, decode_json, encode, encode_json
@@ -28,6 +27,7 @@ from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.transport.session import open_session
 from tests.support import same_bits, tasks
 from tests.support.failures import failure
+from tests.support.hand import direct
 from tests.support.samples import JSON, MSGPACK
 
 RUN, GENERATIONS, POPULATION = "test", 4, 4
@@ -88,10 +88,7 @@ class Attacker:
         record = direct(lambda heard: self.overheard.append(str(heard.key_expr)))
         kinds = ("job", "result", "beat", "upload")
         self._held += [session.declare_subscriber(keys.all_workers(kind, RUN), record) for kind in kinds]
-        self._held += [
-            session.declare_subscriber(whole, record),
-            session.liveliness().declare_subscriber(whole, record),
-        ]
+        self._held += [each.declare_subscriber(whole, record) for each in (session, session.liveliness())]
         self._held += [self.session.liveliness().declare_token(key) for key in CLAIMED]
         self._held += [session.declare_queryable(key, direct(self._answer)) for key in answered]
 
@@ -156,10 +153,6 @@ class Attacker:
             own = {"vectors": (), "jobs": (), "cancels": (), "verdicts": (), **changes}
             batch = msgspec.structs.replace(self.head, **own)
             self.session.put(keys.job(RUN, self.worker), encode(batch))
-
-
-def direct(callback):
-    return zenoh.handlers.Callback(callback, indirect=False)
 
 
 def lie(digest):

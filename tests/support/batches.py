@@ -1,12 +1,10 @@
 """Real runs that score submitted batches: a coordinator, workers, and counts of what was scored."""
 
-import sqlite3
-
 import numpy as np
 
 from dreamfleet import RemoteScorer
-from dreamfleet.common.runs.run_paths import JOURNAL
 from tests.support import tasks
+from tests.support.journals import change_journal
 
 SIZE = 867  # parameters of a linear controller of the random bundle
 TIMEOUT = 120.0
@@ -25,16 +23,6 @@ def vectors(count, first=0.0):
     return np.linspace(first, first + 1, count * SIZE, dtype=np.float32).reshape(count, SIZE)
 
 
-def rows(processes, query, name="test"):
-    """What a run's journal says now."""
-    where = (processes.runs / name / JOURNAL).absolute().as_uri()
-    connection = sqlite3.connect(f"{where}?mode=ro", uri=True, timeout=30)
-    try:
-        return connection.execute(query).fetchall()
-    finally:
-        connection.close()
-
-
-def count_results(processes, name="test"):
+def count_results(processes):
     """Accepted results, and their environment steps."""
-    return rows(processes, "SELECT count(*), sum(steps) FROM result", name)[0]
+    return change_journal(processes.runs / "test", "SELECT count(*), sum(steps) FROM result")[0]

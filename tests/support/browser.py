@@ -37,16 +37,16 @@ def tab(browser, **options):
 
 
 @contextmanager
-def dashboard(processes, *flags, runs=None):
+def dashboard(processes, *flags):
     """Its process, and the address that it printed."""
-    runs = runs or processes.runs
-    started = processes.start("dashboard", "--connect", processes.endpoint, "--runs-dir", runs, "--port", 0, *flags)
+    where = ("--connect", processes.endpoint, "--runs-dir", processes.runs, "--port", 0)
+    started = processes.start("dashboard", *where, *flags)
     started.address = started.wait_for_report(ADDRESS)
     yield started
     started.end()
 
 
-def wait_for_text(page, text, part):
+def wait_for_text(page, text, part="state"):
     """Wait until the page has the text in this part."""
     script = "([part, text]) => document.querySelector(`[data-part=${part}]`)?.textContent.includes(text)"
     wait_until(page, script, [part, text])

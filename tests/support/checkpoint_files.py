@@ -1,47 +1,42 @@
-"""Synthetic files in the exact layout of ctallec/world-models, and its formulas in NumPy."""
+"""Synthetic files in the exact layout of ctallec/world-models, and its models in double precision."""
 
 from itertools import pairwise
 
 import numpy as np
 import torch
+from torch import nn
 
 LATENT, HIDDEN, MIXTURES, ACTIONS = 32, 256, 5, 3
 CHANNELS = (3, 32, 64, 128, 256)
 ROWS = (2 * LATENT + 1) * MIXTURES + 2
 UP = ((5, 1024, 128), (5, 128, 64), (6, 64, 32), (6, 32, 3))
+GAIN = 3  # of the weights with which torch begins: pictures and actions differ clearly
+
+
+def models():
+    """Its VAE, MDN-RNN and controller, with its names."""
+    down = {f"conv{index}": nn.Conv2d(*each, 4, stride=2) for index, each in enumerate(pairwise(CHANNELS), 1)}
+    up = {f"deconv{index}": nn.ConvTranspose2d(*each, size, stride=2) for index, (size, *each) in enumerate(UP, 1)}
+    latents = {name: nn.Linear(1024, LATENT) for name in ("fc_mu", "fc_logsigma")}
+    parts = {"encoder": down | latents, "decoder": {"fc1": nn.Linear(LATENT, 1024), **up}}
+    vae = nn.ModuleDict({name: nn.ModuleDict(layers) for name, layers in parts.items()})
+    rnn = nn.ModuleDict({"gmm_linear": nn.Linear(HIDDEN, ROWS), "rnn": nn.LSTM(ACTIONS + LATENT, HIDDEN)})
+    return vae, rnn, nn.ModuleDict({"fc": nn.Linear(LATENT + HIDDEN, ACTIONS)})
 
 
 def random_weights(seed=1):
     """Weights of its three models by their names, as float32 arrays."""
-    random = np.random.default_rng(seed)
-    vae, rnn, controller = {}, {}, {}
+    with torch.random.fork_rng(devices=()):
+        torch.manual_seed(seed)
+        states = [model.state_dict() for model in models()]
+    return tuple({name: GAIN * value.numpy() for name, value in each.items()} for each in states)
 
-    def add(weights, name, *shape, scale):
-        weights[f"{name}.weight"] = random.normal(0, scale, shape).astype(np.float32)
 
-    def bias(weights, name, size, scale=0.1):
-        weights[f"{name}.bias"] = random.normal(0, scale, size).astype(np.float32)
-
-    for index, (before, after) in enumerate(pairwise(CHANNELS), 1):
-        add(vae, f"encoder.conv{index}", after, before, 4, 4, scale=(8 * before) ** -0.5)
-        bias(vae, f"encoder.conv{index}", after)
-    for name in ("fc_mu", "fc_logsigma"):
-        add(vae, f"encoder.{name}", LATENT, 1024, scale=1024**-0.5)
-        bias(vae, f"encoder.{name}", LATENT)
-    add(vae, "decoder.fc1", 1024, LATENT, scale=0.2)
-    bias(vae, "decoder.fc1", 1024)
-    for index, (size, before, after) in enumerate(UP, 1):
-        add(vae, f"decoder.deconv{index}", before, after, size, size, scale=(2 * before) ** -0.5)
-        bias(vae, f"decoder.deconv{index}", after)
-    add(rnn, "gmm_linear", ROWS, HIDDEN, scale=0.1)
-    bias(rnn, "gmm_linear", ROWS)
-    for name, shape in (("weight_ih", (4 * HIDDEN, ACTIONS + LATENT)), ("weight_hh", (4 * HIDDEN, HIDDEN))):
-        rnn[f"rnn.{name}_l0"] = random.normal(0, 0.1, shape).astype(np.float32)
-    for name in ("bias_ih", "bias_hh"):
-        rnn[f"rnn.{name}_l0"] = random.normal(0, 0.1, 4 * HIDDEN).astype(np.float32)
-    add(controller, "fc", ACTIONS, LATENT + HIDDEN, scale=0.2)
-    bias(controller, "fc", ACTIONS)
-    return vae, rnn, controller
+def with_weights(number, weights):
+    """One of the models in double precision."""
+    model = models()[number].requires_grad_(False)
+    model.load_state_dict({name: torch.from_numpy(array) for name, array in weights.items()})
+    return model.double()
 
 
 def write_checkpoints(folder, weights, *, legacy=False, with_reward=True):
@@ -65,7 +60,7 @@ def write_checkpoints(folder, weights, *, legacy=False, with_reward=True):
 
 def as_state(weights):
     """A state_dict as a module has it, with its metadata."""
-    module = torch.nn.ParameterDict()
+    module = nn.ParameterDict()
     state = type(module.state_dict())((name, torch.from_numpy(array)) for name, array in weights.items())
     state._metadata = {"": {"version": 1}}
     return state
@@ -75,62 +70,57 @@ def sigmoid(value):
     return 1 / (1 + np.exp(-value))
 
 
-def encode(vae, picture):
-    """The mean latent of a picture `(64, 64, 3)`, in double precision."""
-    value = picture.astype(np.float64).transpose(2, 0, 1) / 255
-    for index in range(1, 5):
-        weight, bias = vae[f"encoder.conv{index}.weight"].astype(float), vae[f"encoder.conv{index}.bias"]
-        side = (value.shape[1] - 4) // 2 + 1
-        spots = [(2 * row, 2 * column) for row in range(side) for column in range(side)]
-        patches = np.stack([value[:, row : row + 4, column : column + 4] for row, column in spots])
-        value = np.maximum(np.tensordot(patches, weight, ([1, 2, 3], [1, 2, 3])) + bias, 0)
-        value = value.T.reshape(-1, side, side)
-    return vae["encoder.fc_mu.weight"].astype(float) @ value.ravel() + vae["encoder.fc_mu.bias"]
-
-
 def decode(vae, latent):
     """The picture `(64, 64, 3)` of a latent, from 0 to 1."""
-    value = np.maximum(vae["decoder.fc1.weight"].astype(float) @ latent + vae["decoder.fc1.bias"], 0)[:, None, None]
-    for index, (size, _, outputs) in enumerate(UP, 1):
-        weight, bias = vae[f"decoder.deconv{index}.weight"].astype(float), vae[f"decoder.deconv{index}.bias"]
-        side = value.shape[1]
-        out = np.zeros((outputs, 2 * (side - 1) + size, 2 * (side - 1) + size)) + bias[:, None, None]
-        for row in range(side):
-            for column in range(side):
-                spot = np.tensordot(value[:, row, column], weight, 1)
-                out[:, 2 * row : 2 * row + size, 2 * column : 2 * column + size] += spot
-        value = np.maximum(out, 0) if index < len(UP) else sigmoid(out)
-    return value.transpose(1, 2, 0)
+    decoder = with_weights(0, vae)["decoder"]
+    value = decoder["fc1"](torch.from_numpy(latent))[None, :, None, None]
+    for index in range(1, len(UP) + 1):
+        value = decoder[f"deconv{index}"](value.relu())
+    return value[0].sigmoid().permute(1, 2, 0).numpy()
 
 
 class Memory:
-    """Its LSTM and heads, in double precision."""
+    """Its LSTM and heads."""
 
     def __init__(self, rnn):
-        self._rnn = {name: array.astype(float) for name, array in rnn.items()}
-        self.hidden = self.cell = np.zeros(HIDDEN)
+        self._model, self._state = with_weights(1, rnn), None
+        self.hidden = torch.zeros(HIDDEN, dtype=torch.float64)
 
     def advance(self, action, latent):
-        rnn = self._rnn
-        gates = rnn["rnn.weight_ih_l0"] @ np.concatenate([action, latent]) + rnn["rnn.bias_ih_l0"]
-        gates = gates + rnn["rnn.weight_hh_l0"] @ self.hidden + rnn["rnn.bias_hh_l0"]
-        enter, forget, candidate, leave = np.split(gates, 4)
-        self.cell = sigmoid(forget) * self.cell + sigmoid(enter) * np.tanh(candidate)
-        self.hidden = sigmoid(leave) * np.tanh(self.cell)
-        out = rnn["gmm_linear.weight"] @ self.hidden + rnn["gmm_linear.bias"]
-        width = MIXTURES * LATENT
+        seen = torch.cat([torch.as_tensor(action), torch.as_tensor(latent)])[None]
+        (self.hidden,), self._state = self._model["rnn"](seen, self._state)
+        out, width = self._model["gmm_linear"](self.hidden).numpy(), MIXTURES * LATENT
         means, spreads = (out[at : at + width].reshape(MIXTURES, LATENT) for at in (0, width))
         return means, np.exp(spreads), out[2 * width : 2 * width + MIXTURES], out[-2], out[-1]
 
 
 def drive(weights, pictures):
     """The actions `(T, 3)` of its controller on pictures `(T, 64, 64, 3)`; the environment limits them."""
-    vae, rnn, controller = weights
-    memory, actions = Memory(rnn), []
-    for picture in pictures:
-        latent = encode(vae, picture)
-        features = np.concatenate([latent, memory.hidden])
-        action = controller["fc.weight"].astype(float) @ features + controller["fc.bias"]
-        memory.advance(action, latent)
-        actions.append(action)
-    return np.array(actions)
+    encoder, memory, controller = (
+        with_weights(0, weights[0])["encoder"],
+        Memory(weights[1]),
+        with_weights(2, weights[2]),
+    )
+    actions = []
+    for picture in torch.from_numpy(pictures).double().permute(0, 3, 1, 2) / 255:
+        value = picture
+        for index in range(1, len(CHANNELS)):
+            value = encoder[f"conv{index}"](value).relu()
+        latent = encoder["fc_mu"](value.flatten())
+        actions.append(controller["fc"](torch.cat([latent, memory.hidden])))
+        memory.advance(actions[-1], latent)
+    return torch.stack(actions).numpy()
+
+
+def write_drive(folder, number, steps=6, size=64):
+    """One of its drives: each picture is the one after its action, and actions are drawn in advance."""
+    random = np.random.default_rng(number)
+    folder.mkdir(parents=True, exist_ok=True)
+    arrays = {
+        "observations": random.integers(0, 256, (steps, size, size, 3), dtype=np.uint8),
+        "rewards": random.random(steps),
+        "actions": random.random((steps + 4, 3)),
+        "terminals": np.arange(steps) == steps - 1,
+    }
+    np.savez(folder / f"rollout_{number}.npz", **arrays)
+    return arrays

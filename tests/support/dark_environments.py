@@ -52,29 +52,16 @@ class Breaking(CartPoleEnv):
             self.break_down()
         return super().step(action)
 
-    def break_down(self):
+    @staticmethod
+    def break_down():
         raise ZeroDivisionError("no road")
 
 
-class Interrupting(Breaking):
-    """Draws pictures, and later raises what Ctrl-C raises."""
-
-    def break_down(self):
-        raise KeyboardInterrupt
+def interrupt():
+    raise KeyboardInterrupt
 
 
-class Leaving(Breaking):
-    """Draws pictures, and ends its process later."""
-
-    def break_down(self):
-        os._exit(3)
-
-
-class Stuck(Breaking):
-    """Draws pictures, and hangs later."""
-
-    def break_down(self):
-        time.sleep(600)
+LATER = {"Interrupting": interrupt, "Leaving": lambda: os._exit(3), "Stuck": lambda: time.sleep(600)}
 
 
 class Slow(Plain):
@@ -93,5 +80,8 @@ class Slow(Plain):
         return np.zeros((64, 64, 3), np.uint8)
 
 
-for each in (Dark, Blank, Raising, Plain, Breaking, Interrupting, Leaving, Stuck, Slow):
+for each in (
+    *(Dark, Blank, Raising, Plain, Breaking, Slow),
+    *(type(name, (Breaking,), {"break_down": staticmethod(how)}) for name, how in LATER.items()),
+):
     gymnasium.register(f"{each.__name__}-v0", entry_point=each)

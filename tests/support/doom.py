@@ -3,7 +3,6 @@
 import hashlib
 import importlib.util
 import os
-import select
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -14,7 +13,7 @@ import pytest
 
 from dreamfleet.worker.worlds.takecover.game import TakeCover
 from dreamfleet.worker.worlds.takecover.process import GAME_NAME_FLAG, SHARED_FILES
-from tests.support.processes import DEADLINE, ROOT
+from tests.support.processes import ROOT
 
 FAKE = Path(__file__).parent / "fake_vizdoom"
 REAL_IS_HERE = importlib.util.find_spec("vizdoom") is not None
@@ -58,11 +57,6 @@ def name_of_game(process):
 def shared_files(name):
     """The files in /dev/shm of the game of this name."""
     return [path for each in SHARED_FILES if (path := SHARED_MEMORY / f"{each}{name}").exists()]
-
-
-def has_ended(process):
-    """Wait for the end of a process, by its descriptor."""
-    return bool(select.select([process], [], [], DEADLINE)[0])
 
 
 def play(seeds, tics=4):

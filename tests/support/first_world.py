@@ -46,7 +46,7 @@ from dreamfleet.worker.worldmodel.mdnrnn import reward_labels
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import random_rnn_weights, random_vae_weights
-from tests.support.drives import write_drives
+from tests.support.drives import ignore, write_drive
 from tests.support.variants import VARIANTS, vectors
 
 GOLD = Path(__file__).parents[1] / "fixtures" / "world_model.json"
@@ -146,10 +146,8 @@ def bundles(folder):
 def training_folder(folder):
     """A data set of made-up drives, of which some ended, encoded by a VAE after three updates."""
     store_preset(folder, "tiny", 0)
-    for path in write_drives(folder, steps=14)[::2]:
-        with np.load(path) as drive:
-            arrays = dict(drive)
-        np.savez_compressed(path, **arrays | {"ended": np.array(True)})
+    for number in range(6):
+        write_drive(folder, number, 14 - number % 3, ended=np.array(number % 2 == 0))
     train_vae.train_vae(folder, SHORT, ignore, SMALL_VAE)
     assert len(list(encode(folder))) == 6
     return folder
@@ -232,10 +230,6 @@ def episodes(_folder):
         found[name] = [hashed_scores([score, plain]), hashed_arrays(rollout.arrays())]
         scorer.close()
     return {"simulator": found}
-
-
-def ignore(*_):
-    pass
 
 
 PARTS: dict[str, Callable[[Path], dict[str, dict]]] = {

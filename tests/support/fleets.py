@@ -26,10 +26,6 @@ class Turn:
     seconds: float
     until: float
 
-    def steps(self, now):
-        """Steps made of the episode's ten."""
-        return max(0, int(10 * (1 - (self.until - now) / self.seconds)))
-
 
 @dataclass
 class Host:
@@ -200,7 +196,8 @@ class Played:
         seen = next(number for number in count() if number + 1 not in host.seen)
         running = [job.digest for turn in host.turns for job in turn.jobs]
         rate = sum(10 * len(turn.jobs) / turn.seconds for turn in host.turns)
-        steps = host.turns[0].steps(self.now) if host.turns else 0
+        done = 1 - (host.turns[0].until - self.now) / host.turns[0].seconds if host.turns else 0
+        steps = max(0, int(10 * done))  # of the episode's ten
         shown = beat(host.slots * host.width, seen, host.numbering, host.queued, running, host.unacked, rate, steps)
         self._at(self.now + host.delay, self._heard, identity, replace(shown, slots=host.slots))
         if not host.turns and self.now - host.heard > SILENT_BEATS:

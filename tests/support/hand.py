@@ -60,9 +60,9 @@ class Hand:
         self.session = beside.session if self._shares else open_session(Network(listen=(self.endpoint,)))
         declare, answer = self.session.declare_subscriber, self.session.declare_queryable
         self._declared = [
-            answer(keys.hello(run), _direct(self._hello)),
-            answer(keys.status(run), _direct(self._status)),
-            answer(keys.bundle(run, bundle.sha256), _direct(self._part)),
+            answer(keys.hello(run), direct(self._hello)),
+            answer(keys.status(run), direct(self._status)),
+            answer(keys.bundle(run, bundle.sha256), direct(self._part)),
             declare(keys.all_workers("result", run), self._hear(ResultBatch)),
             declare(keys.all_workers("beat", run), self._hear(Heartbeat)),
             declare(keys.all_workers("upload", run), self._hear(UploadPart)),
@@ -156,7 +156,7 @@ class Hand:
             if kind is Heartbeat and self.answers:
                 self.send(0, vectors=())
 
-        return _direct(hear)
+        return direct(hear)
 
     def _hello(self, query):
         with query:
@@ -216,5 +216,5 @@ def tag(job):
     return job.digest[:TAG_BYTES]
 
 
-def _direct(callback):
+def direct(callback):
     return zenoh.handlers.Callback(callback, indirect=False)

@@ -14,6 +14,8 @@ from gymnasium import spaces
 from tests.support.pixel_world import HEIGHT, WIDTH, Dodge
 
 MODULE = "tests.support.pixel_fakes"
+HAND = spaces.Discrete(3, start=5)
+SWITCHES = spaces.Tuple((spaces.MultiDiscrete([2]), spaces.MultiBinary(2)))
 
 
 class Observing(Dodge):
@@ -187,11 +189,7 @@ class Gauges(gymnasium.Env):
     """No pictures: observes a Dict of numbers of all kinds, and takes a Dict of numbered actions."""
 
     observation_space = spaces.Dict(
-        {
-            "switches": spaces.Tuple((spaces.MultiDiscrete([2]), spaces.MultiBinary(2))),
-            "speeds": spaces.Box(-1, 1, (2, 1), np.float32),
-            "hand": spaces.Discrete(3, start=5),
-        }
+        {"switches": SWITCHES, "speeds": spaces.Box(-1, 1, (2, 1), np.float32), "hand": HAND}
     )
     action_space = spaces.Dict({"lamps": spaces.MultiBinary(1), "gear": spaces.Discrete(2, start=1)})
 
@@ -213,13 +211,8 @@ class Gauges(gymnasium.Env):
 class Telling(Gauges):
     """Observes texts among numbers, as MiniGrid does, and deeper ones too."""
 
-    observation_space = spaces.Dict(
-        {
-            "hand": spaces.Discrete(3, start=5),
-            "mission": spaces.Text(9),
-            "notes": spaces.Tuple((spaces.Text(3), spaces.Box(-1, 1, (2,), np.float32))),
-        }
-    )
+    notes = spaces.Tuple((spaces.Text(3), spaces.Box(-1, 1, (2,), np.float32)))
+    observation_space = spaces.Dict({"hand": HAND, "mission": spaces.Text(9), "notes": notes})
 
     def observe(self):
         return {"hand": np.int64(7), "mission": "go", "notes": ("so", np.float32([0.5, 0.25]))}

@@ -48,11 +48,17 @@ def call_here(*words):
     return code, out.getvalue(), err.getvalue()
 
 
-def printed(*words):
-    """What a verb prints that ends well in this process."""
-    code, out, err = call_here(*words)
+def printed(*words, call=call_here):
+    """What a verb prints that ends well in this process, or by another `call`."""
+    code, out, err = call(*words)
     assert code == 0, err
     return out
+
+
+def refused(datum, *words, code=2, call=call_here):
+    """Assert that a verb ends with this exit code and a line with this datum."""
+    found, out, err = call(*words)
+    assert (found, datum in err.strip().splitlines()[-1], "Traceback" in out + err) == (code, True, False), err
 
 
 def environment(cache, root=ROOT):
@@ -220,6 +226,12 @@ class Processes:
         )  # fmt: skip
         return done.returncode, done.stdout, done.stderr
 
+    def printed(self, *arguments):
+        return printed(*arguments, call=self.call)
+
+    def refused(self, datum, *arguments, code=2):
+        refused(datum, *arguments, code=code, call=self.call)
+
     def status(self):
         """The raw status of the only live run; `None` if none answers."""
         try:
@@ -227,11 +239,6 @@ class Processes:
                 return client.document()
         except ConnectionFailedError:
             return None
-
-    def statuses(self):
-        """The status of every live run, most slots first."""
-        with Client((self.endpoint,)) as client:
-            return sorted((client.status(run) for run in client.runs()), key=lambda status: -status.slots)
 
     def end(self):
         for process in self._started:

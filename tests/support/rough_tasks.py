@@ -73,61 +73,58 @@ def wait_for_one_left():
         time.sleep(0.01)
 
 
+def hang():
+    time.sleep(600)
+
+
 class Forking(Rough):
     """A forked process holds copies of the pipe; then the child crashes."""
 
-    def misbehave(self):
-        hold_copies()
+    end = staticmethod(segfault)
+
+    def leave(self):
         if os.fork() == 0:
             linger()
-        wait_for_one_left()
-        segfault()
-
-
-class ForkingBySystemCall(Rough):
-    """As a simulator in C does it, so Python's hooks do not run."""
-
-    def misbehave(self):
-        if ctypes.PyDLL(None).fork() == 0:
-            linger()
-        wait_for_one_left()
-        segfault()
-
-
-class Daemonizing(Rough):
-    """The forked process leaves the session and its parent."""
 
     def misbehave(self):
         hold_copies()
+        self.leave()
+        wait_for_one_left()
+        self.end()
+
+
+class ForkingBySystemCall(Forking):
+    """As a simulator in C does it, so Python's hooks do not run."""
+
+    def leave(self):
+        if ctypes.PyDLL(None).fork() == 0:
+            linger()
+
+
+class Daemonizing(Forking):
+    """The forked process leaves the session and its parent."""
+
+    def leave(self):
         if os.fork() == 0:
             os.setsid()
             if os.fork() == 0:
                 linger()
             os._exit(0)
-        wait_for_one_left()
-        segfault()
 
 
-class Executing(Rough):
+class Executing(Forking):
     """Starts a program with an environment of its own in a process group of its own."""
 
-    def misbehave(self):
+    def leave(self):
         subprocess.Popen(
             [sys.executable, "-S", "-c", SLEEP], env={FOLDER: os.environ[FOLDER]}, process_group=0, close_fds=False
         )
-        wait_for_one_left()
-        segfault()
 
 
-class ForkingAndHanging(Rough):
-    """A daemon is left behind, and the child runs on."""
+class ForkingAndHanging(Daemonizing):
+    """The child runs on."""
 
-    def misbehave(self):
-        if os.fork() == 0:
-            os.setsid()
-            linger()
-        wait_for_one_left()
-        time.sleep(600)
+    end = staticmethod(hang)
 
 
 class Rubbish(Rough):
@@ -183,10 +180,6 @@ class Parallel(Rough):
 def leak_descriptors():
     while True:
         os.dup(0)
-
-
-def hang():
-    time.sleep(600)
 
 
 def starve():

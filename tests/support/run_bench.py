@@ -1,8 +1,9 @@
 """A run whose messages and clock a test moves, without a transport."""
 
 import hashlib
+from dataclasses import replace
 
-from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.protocol.host_classes import class_from_fingerprint
 from dreamfleet.common.protocol.messages import (
     MAX_PART,
@@ -16,6 +17,7 @@ from dreamfleet.common.protocol.messages import (
 )
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.run.worker_protocol import WorkerProtocol
 from dreamfleet.coordinator.settings.limits import LimitsConfig
@@ -145,6 +147,16 @@ class Bench:
         job = self.given.pop(index)
         self.answer(result(job.digest, self.fitness_of(job)))
 
+    def close(self, generations):
+        """Answer jobs until so many generations are closed and no background job is in progress."""
+        while len(self.run.history) < generations or self.run.background_jobs.in_progress:
+            self.step()
+
+    def saved(self):
+        """The reported controller, if there is one."""
+        path = self.path / CONTROLLER
+        return Controller.load(path) if path.exists() else None
+
     def step(self):
         """Answer the first job that was given."""
         self.fetch()
@@ -172,6 +184,15 @@ class Bench:
     def kept(self):
         with RunFolder(self.path) as folder:
             return [path.read_bytes() for path in folder.rollouts()]
+
+
+EVALUATED = replace(SETTINGS, collect_every=0, evaluate_every=2, evaluation_episodes=2, population=4)
+SCORES = {1: 10.0, 3: 5.0}  # of the mean after a generation
+
+
+class Reporting(Bench):
+    def fitness_of(self, job):
+        return SCORES[job.generation] if job.kind == "evaluate" else float(job.digest[0])
 
 
 def drive_of(job):

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dreamfleet.common.runs.run_folder import open_run
+from tests.support.processes import call_here, printed
 
 GENERATIONS, POPULATION, EPISODES = 4, 6, 2
 
@@ -52,3 +53,9 @@ def evolve(processes, name, workers, *settings, task=()):
     for each in crew:
         each.end()
     return outcome(processes, name)
+
+
+def check_replay(processes, name, candidate, episodes, *more, call=call_here):
+    """Assert that a candidate's episodes give the same bits again."""
+    words = ("verify", "candidate", name, "--runs-dir", processes.runs, "--candidate", candidate, *more)
+    assert printed(*words, call=call).count("same bits") == episodes

@@ -62,6 +62,13 @@ def batch(number, jobs=(), vectors=(WHOLE,), cancels=()):
     )
 
 
+NONCE = "c0ffee00c0ffee00"
+BEAT = {**HEAD, "nonce": NONCE, "numbering": 3, "seen": 9, "capacity": 4, "slots": 4, "load": 1.5,
+        "steps_per_second": 987.5, "drawn_by": "native"}  # fmt: skip
+WELCOME = (
+    "0.1.0", "night", UID, 3, NONCE, "", "",
+    {"task": "car-racing", "bundle": "ab" * 32, "horizon": 1000, "patience": 100}, {"beat": 1.0, "repeat": 1.0},
+)  # fmt: skip
 MSGPACK = {
     "job": JobBatch(
         **HEAD, nonce="c0ffee00c0ffee00", numbering=3, number=9, vectors=(WHOLE,),
@@ -84,14 +91,9 @@ MSGPACK = {
         **HEAD, fingerprint="x86_64 avx2", results=(Result(b"\x01" * 32, 812.5, 1000, 7.25, None, None),),
         host_class="0123456789abcdef",
     ),
-    "beat-classed": Heartbeat(
-        **HEAD, nonce="c0ffee00c0ffee00", numbering=3, seen=9, capacity=4, slots=4, queued=(), running=(), unacked=(),
-        load=1.5, steps_per_second=987.5, drawn_by="native", host_class="0123456789abcdef",
-    ),
+    "beat-classed": Heartbeat(**BEAT, queued=(), running=(), unacked=(), host_class="0123456789abcdef"),
     "beat": Heartbeat(
-        **HEAD, nonce="c0ffee00c0ffee00", numbering=3, seen=9, capacity=4, slots=4, queued=(b"abcdefgh",),
-        running=(RunningJob(b"ABCDEFGH", 412),), unacked=(b"12345678",), load=1.5, steps_per_second=987.5,
-        drawn_by="native",
+        **BEAT, queued=(b"abcdefgh",), running=(RunningJob(b"ABCDEFGH", 412),), unacked=(b"12345678",)
     ),
     "bundle": BundlePart(**HEAD, sha256=b"\xab" * 32, offset=40960, total=14302154, data=b"part of a bundle"),
     "upload": UploadPart(
@@ -106,15 +108,8 @@ MSGPACK = {
 }  # fmt: skip
 JSON = {
     "hello-request": HelloRequest(1, 1, "0.1.0", "host-a/0a1b2c3d", ("car-racing", "dream"), "x86_64 avx2", 8),
-    "hello-reply": HelloReply(
-        True, 1, 1, "0.1.0", "night", UID, 3, "c0ffee00c0ffee00", "", "",
-        {"task": "car-racing", "bundle": "ab" * 32, "horizon": 1000, "patience": 100}, {"beat": 1.0, "repeat": 1.0},
-    ),
-    "hello-reply-numbered": HelloReply(
-        True, 2, 2, "0.1.0", "night", UID, 3, "c0ffee00c0ffee00", "", "",
-        {"task": "car-racing", "bundle": "ab" * 32, "horizon": 1000, "patience": 100}, {"beat": 1.0, "repeat": 1.0},
-        numbering=4,
-    ),
+    "hello-reply": HelloReply(True, 1, 1, *WELCOME),
+    "hello-reply-numbered": HelloReply(True, 2, 2, *WELCOME, numbering=4),
     "hello-request-classed": HelloRequest(
         2, 2, "0.1.0", "host-a/0a1b2c3d", ("car-racing", "dream"), "x86_64 avx2", 8, host_class="0123456789abcdef"
     ),

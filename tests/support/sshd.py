@@ -4,7 +4,6 @@ import getpass
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -128,12 +127,6 @@ def ssh_hosts(folder):
         yield hosts
     finally:
         hosts.stop()
-
-
-def closed_port():
-    with socket.socket() as sock:
-        sock.bind(("127.0.0.1", 0))
-        return sock.getsockname()[1]
 
 
 def new_key(path):

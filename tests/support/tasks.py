@@ -14,16 +14,12 @@ from gymnasium import spaces
 from dreamfleet.worker.tasks.api import Continuous, Score, Task, World
 
 MODULE = "tests.support.tasks"
+NAMES = """Toy SlowToy Raising Crashing Nan Hanging Silent Judged Counted Heavy Chatty Painted Rounded SecondToy Brittle
+Exploding"""
 (
     TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, CHATTY, PAINTED, ROUNDED,
     SECOND_TOY, BRITTLE, EXPLODING,
-) = (
-    f"{MODULE}:{name}"
-    for name in (
-        "Toy", "SlowToy", "Raising", "Crashing", "Nan", "Hanging", "Silent", "Judged", "Counted", "Heavy", "Chatty",
-        "Painted", "Rounded", "SecondToy", "Brittle", "Exploding",
-    )
-)  # fmt: skip
+) = (f"{MODULE}:{name}" for name in NAMES.split())  # fmt: skip
 ALL = TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, PAINTED
 STEPS_FOLDER = "DREAMFLEET_TEST_STEPS"  # where `Counted` writes
 ROUNDING = "DREAMFLEET_TEST_ROUNDING"  # if set, `Rounded` computes as on another host class
@@ -304,10 +300,15 @@ class Heavy(Toy):
     environment = HeavyEnvironment
 
 
-class OnesBatch:
+class FlatBatch:
+    """Each episode has this fitness and so many steps."""
+
+    def __init__(self, fitness, steps):
+        self._score = Score(fitness, steps)
+
     def score(self, episodes, on_step):
-        on_step(len(episodes))
-        return [Score(1.0, 1)] * len(episodes)
+        on_step(self._score.steps)
+        return [self._score] * len(episodes)
 
 
 class OnTorch(Toy):
@@ -316,20 +317,14 @@ class OnTorch(Toy):
     batch_size, torch_batch_size = 256, 8
 
     def make_batch(self, assignment):
-        return OnesBatch()
-
-
-class ExplodingBatch:
-    def score(self, episodes, on_step):
-        on_step(10)
-        return [Score(1.7e308, 10) for _ in episodes]
+        return FlatBatch(1.0, 1)
 
 
 class Exploding(Toy):
     """A slot scores episodes together; rewards are finite, but their mean overflows."""
 
     def make_batch(self, assignment):
-        return ExplodingBatch()
+        return FlatBatch(1.7e308, 10)
 
 
 class PaintedEnvironment(ToyEnvironment):

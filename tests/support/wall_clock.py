@@ -9,7 +9,6 @@ SOURCE = r"""
 #include <fcntl.h>
 #include <stdlib.h>
 #include <sys/mman.h>
-#include <sys/time.h>
 #include <time.h>
 
 static long offset(void) {  /* seconds, as the file has them now */
@@ -27,13 +26,6 @@ int clock_gettime(clockid_t clock, struct timespec *now) {
     if (!real) real = dlsym(RTLD_NEXT, "clock_gettime");
     int failed = real(clock, now);
     if (!failed && clock == CLOCK_REALTIME) now->tv_sec += offset();
-    return failed;
-}
-
-int gettimeofday(struct timeval *now, void *zone) {
-    struct timespec exact;
-    int failed = clock_gettime(CLOCK_REALTIME, &exact);
-    now->tv_sec = exact.tv_sec, now->tv_usec = exact.tv_nsec / 1000;
     return failed;
 }
 

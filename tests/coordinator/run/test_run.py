@@ -24,8 +24,7 @@ from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.start import find_start
 from tests.support.dispatched import result
 from tests.support.failures import failure
-from tests.support.reporting_runs import EVALUATED, Reporting
-from tests.support.run_bench import DRIVES, SETTINGS, A, B, Bench, drive_of, result_of
+from tests.support.run_bench import DRIVES, EVALUATED, SETTINGS, A, B, Bench, Reporting, drive_of, result_of
 
 
 @pytest.fixture

@@ -30,7 +30,7 @@ from dreamfleet.coordinator.settings.start import StartPoint, find_start, stored
 from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.experiments.rerun import Rerun
 from tests.support.dispatched import result
-from tests.support.reporting_runs import EVALUATED, Reporting
+from tests.support.run_bench import EVALUATED, Reporting
 
 
 class Spending(Reporting):

@@ -14,9 +14,7 @@ from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.worker.addons.importing.checkpoints import read_mdnrnn, read_vae
 from dreamfleet.worker.worldmodel.inference import Decoder, DreamStep
-from tests.support import checkpoint_files
 from tests.support import checkpoint_files as theirs
-from tests.support.foreign_drives import ctallec_drive
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +141,7 @@ TYPED = [
 def sources(tmp_path_factory):
     """A folder with the files that the three programs write, and a world model `world.zip`."""
     folder = tmp_path_factory.mktemp("sources")
-    checkpoint_files.write_checkpoints(folder / "exp_dir", checkpoint_files.random_weights())
+    theirs.write_checkpoints(folder / "exp_dir", theirs.random_weights())
     assert main(["import", str(folder / "exp_dir"), "--out", str(folder / "world.zip")]) == 0
     for place in (WME, ARTICLE):
         (folder / place).parent.mkdir()
@@ -161,7 +159,7 @@ def sources(tmp_path_factory):
         for number in (1520837, 934721):
             np.savez_compressed(folder / place / f"{number}.npz", **arrays)
     for number in range(2):
-        ctallec_drive(folder / "datasets" / "carracing" / f"thread_{number}", number)
+        theirs.write_drive(folder / "datasets" / "carracing" / f"thread_{number}", number)
     for part in ("vae", "rnn"):
         (folder / part).mkdir()
         (folder / part / "weights.h5").write_bytes(b"\x89HDF\r\n\x1a\n")

@@ -19,7 +19,7 @@ from dreamfleet.worker.addons.importing.drives import read_drive
 from dreamfleet.worker.addons.importing.vectors import read_vector, to_parameters
 from dreamfleet.worker.training.data.dataset import episode_paths, find_world, kind_of, load_pictures, load_steps
 from dreamfleet.worker.worlds.car_racing.preprocessing import BOX
-from tests.support.foreign_drives import ctallec_drive
+from tests.support.checkpoint_files import write_drive as ctallec_drive
 from tests.support.samples import SPEC
 
 

@@ -31,8 +31,8 @@ from dreamfleet.worker.worlds.takecover.options import TakeCoverOptions
 from dreamfleet.worker.worlds.takecover.process import ARGUMENTS, FOLDER_PREFIX, GAME_NAME_FLAG, SHARED_FILES
 from dreamfleet.worker.worlds.takecover.task import TakeCoverTask, cut_in_thirds, pick_choice
 from tests.support.bundles import write_world_bundle
-from tests.support.doom import games, has_ended, name_of_game, play, search_path, shared_files
-from tests.support.processes import DEADLINE
+from tests.support.doom import games, name_of_game, play, search_path, shared_files
+from tests.support.processes import DEADLINE, ends
 from tests.support.specs import described_spec
 from tests.support.variants import vectors
 from tests.support.world_contract import check_world
@@ -280,7 +280,7 @@ def test_nothing_is_left_while_a_game_plays_nor_afterwards(temporary, game):
     assert (list(Path().iterdir()), folders(temporary), shared_files(name)) == ([], [], [])
     game.step(0)
     game.close()
-    assert has_ended(running)
+    assert ends(running)
     assert (list(Path().iterdir()), folders(temporary), shared_files(name)) == ([], [], [])
 
 
@@ -290,7 +290,7 @@ def test_a_game_ends_with_its_process_however_that_ends(doom, temporary, tmp_pat
         assert program.stdout.readline() == "plays\n"
         running, name = only_game(program.pid)
         program.communicate("\n", timeout=DEADLINE)
-    assert has_ended(running)
+    assert ends(running)
     assert (folders(temporary), shared_files(name)) == ([], [])
 
 
@@ -301,7 +301,7 @@ def test_a_game_ends_with_its_slot(doom, temporary):
     assert isinstance(events.get(timeout=DEADLINE), ChildReady)
     running, name = only_game(child.pid)
     os.kill(child.pid, signal.SIGKILL)
-    assert has_ended(running)
+    assert ends(running)
     child.close()
     assert (folders(temporary), shared_files(name)) == ([], [])
 
@@ -353,7 +353,7 @@ def test_a_crashed_game_is_an_error_and_the_next_episode_starts_another(game):
     first, _ = game.reset(seed=1)
     running, _ = only_game(os.getpid())
     signal.pidfd_send_signal(running, signal.SIGKILL)
-    assert has_ended(running)
+    assert ends(running)
     with pytest.raises(Exception, match=r"crash|not running"):
         game.step(0)
     assert (game.reset(seed=1)[0] == first).all()
