@@ -49,7 +49,7 @@ def test_batches_are_scored_and_the_same_content_is_never_scored_twice(fleet):
         code, out, err = fleet.call(*verb)
         assert code == 0, (verb, err)
         assert "step size" not in out
-    out = fleet.printed("verify", "candidate", "test", "--candidate", "0/1", "--runs-dir", fleet.runs)
+    fleet.printed("verify", "candidate", "test", "--candidate", "0/1", "--runs-dir", fleet.runs)
 
 
 def test_wrong_batches_are_refused_and_lose_nothing(fleet):
