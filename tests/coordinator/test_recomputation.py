@@ -92,19 +92,15 @@ class Recomputed:
         return left[0], scores.mean(), scores.std(ddof=1) / np.sqrt(len(scores))
 
 
-def search(settings, size):
-    """pycma with the run's random numbers."""
-    random = np.random.Generator(np.random.PCG64(settings["seed"]))
-    options = {
-        "popsize": settings["population"], "CMA_diagonal": True, "seed": np.nan, "verbose": -9,
-        "randn": lambda *shape: random.standard_normal(shape),
-    }  # fmt: skip
-    return cma.CMAEvolutionStrategy(np.zeros(size), settings["sigma0"], options)
-
-
 def check_search(found):
     """Population, step size, fitness, ranks and statistics of each generation, and the mean that was evaluated."""
-    strategy = search(found.settings, len(found.candidates[0, 0][0]))
+    random = np.random.Generator(np.random.PCG64(found.settings["seed"]))
+    options = {  # pycma with the run's random numbers
+        "popsize": found.settings["population"], "CMA_diagonal": True, "seed": np.nan, "verbose": -9,
+        "randn": lambda *shape: random.standard_normal(shape),
+    }  # fmt: skip
+    size = len(found.candidates[0, 0][0])
+    strategy = cma.CMAEvolutionStrategy(np.zeros(size), found.settings["sigma0"], options)
     for number, seeds, sigma, mean, std, best, worst, steps in found.generations:
         assert sigma == pytest.approx(np.median(strategy.stds), rel=1e-12)
         asked = strategy.ask()

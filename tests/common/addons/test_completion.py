@@ -17,14 +17,6 @@ printf '%s\\n' "${COMPREPLY[@]}"
 """
 
 
-@pytest.fixture
-def script(tmp_path, capsys):
-    assert command_line.main(["completion", "bash"]) == 0
-    path = tmp_path / "dreamfleet.bash"
-    path.write_text(capsys.readouterr().out)
-    return path
-
-
 @pytest.mark.parametrize(
     ("typed", "offered"),
     [
@@ -35,7 +27,10 @@ def script(tmp_path, capsys):
         (("train", "mdn"), {"mdnrnn"}),
     ],
 )
-def test_bash_completes_verbs_and_flags(script, typed, offered):
+def test_bash_completes_verbs_and_flags(tmp_path, capsys, typed, offered):
+    assert command_line.main(["completion", "bash"]) == 0
+    script = tmp_path / "dreamfleet.bash"
+    script.write_text(capsys.readouterr().out)
     command = ["bash", "-c", PRESS_TAB, "-", script, "dreamfleet", *typed]
     done = subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE, check=True)
     assert offered <= {line.strip() for line in done.stdout.splitlines()}, done.stderr

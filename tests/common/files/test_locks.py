@@ -28,14 +28,9 @@ LOCKS = {
 }
 
 
-@pytest.fixture(params=LOCKS)
-def locked(request):
-    return LOCKS[request.param]
-
-
+@pytest.mark.parametrize(("hold", "name"), LOCKS.values(), ids=LOCKS)
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, lambda lock: lock.symlink_to(lock.parents[1] / "own")])
-def test_a_pipe_a_folder_or_a_link_is_refused_at_once_and_what_a_lock_file_holds_stays(tmp_path, locked, make):
-    hold, name = locked
+def test_a_pipe_a_folder_or_a_link_is_refused_at_once_and_what_a_lock_file_holds_stays(tmp_path, hold, name, make):
     own, lock = tmp_path / "own", tmp_path / "folder" / name
     own.write_text("mine")
     lock.parent.mkdir()

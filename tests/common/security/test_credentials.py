@@ -1,14 +1,19 @@
-"""Join files: issued by an authority, validated strictly, and private.
-Tests common/addons/access/authority.py and certificate_ledger.py."""
+"""Join files: issued by an authority, validated strictly, and private; one that was edited, or is used while the clock
+is wrong, is found before it is used. Connections are limited.
+Tests connection_limiter.py, handshake.py, common/addons/access/authority.py and certificate_ledger.py."""
 
 import errno
 import json
+import logging
 import os
 import re
+import shlex
 import shutil
 import socket
 import stat
+import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from itertools import count
@@ -16,18 +21,31 @@ from pathlib import Path
 from threading import Event
 
 import pytest
+import zenoh
 
 from dreamfleet.common.addons.access import authority
 from dreamfleet.common.addons.access.authority import Authority, save_ledger, with_revoked
+from dreamfleet.common.addons.doctor.health import _check_join_file
 from dreamfleet.common.addons.router import verb as router
 from dreamfleet.common.cli.command_line import main
-from dreamfleet.common.errors import AccessError, DreamfleetError, UsageError
+from dreamfleet.common.errors import AccessError, ConnectionFailedError, DreamfleetError, UsageError
 from dreamfleet.common.security import certificate_ledger
 from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, CertificateLedger, RevocationWatcher
-from dreamfleet.common.security.credentials import MAX_BYTES, add_seat_to_name, read_join_file, worker_seat_identity
-from dreamfleet.common.security.handshake import diagnose_connection
+from dreamfleet.common.security.connection_limiter import MAX_UNAUTHENTICATED
+from dreamfleet.common.security.credentials import (
+    MAX_BYTES,
+    SEATS,
+    add_seat_to_name,
+    format_join_file,
+    issue_command,
+    read_join_file,
+    worker_seat_identity,
+)
+from dreamfleet.common.security.handshake import EXPIRED, NOT_YET_VALID, check_certificate, diagnose_connection
 from dreamfleet.common.transport.network import Network
-from tests.support.processes import free_port
+from dreamfleet.common.transport.session import open_session, zenoh_config
+from tests.support.access import Access
+from tests.support.processes import DEADLINE, free_port, until
 
 HERE = ["tls/127.0.0.1:7447"]
 
@@ -332,3 +350,136 @@ def test_damage_is_an_error_without_traceback(join, ca, host):
         endpoint = f"tls/{host}:{server.getsockname()[1]}"
         said = diagnose_connection([endpoint], replace(read_join_file(join), ca=ca))
     assert (said is None) == (host != "127.0.0.1")
+
+
+ROLES = ("coordinator", "first", "viewer", "operator")
+
+
+@pytest.fixture(scope="module")
+def seats(tmp_path_factory):
+    return Access(tmp_path_factory.mktemp("keys") / "access")
+
+
+def test_what_was_issued_is_in_order(seats, tmp_path):
+    for issued in (seats, Access(tmp_path / "access", passwords=True)):
+        assert {check_certificate(read_join_file(issued.path(each))) for each in ROLES} == {None}
+
+
+def test_each_field_that_the_certificate_has_too_must_agree(seats, tmp_path):
+    other = Access(tmp_path / "access")
+    for whole, foreign in ((read_join_file(each.path(who)) for each in (seats, other)) for who in ROLES):
+        edits = [
+            {"seat": whole.seat + 1},
+            {"role": "router"},
+            {"expires": whole.expires + timedelta(days=1)},
+            {"ca": foreign.ca},
+            {"key": foreign.key},
+            {"ca": ""},
+            {"key": ""},
+            {"certificate": whole.certificate[:300]},
+            {"ca": "gärbage", "certificate": "x"},
+        ]
+        for edit in edits:
+            with pytest.raises(AccessError):
+                check_certificate(replace(whole, **edit))
+        check_certificate(replace(whole, connect=("tls/elsewhere.example:7447",), name="renamed"))
+
+
+@pytest.mark.parametrize("verb", ["coordinator", "worker", "status", "router"])
+def test_every_verb_refuses_an_edited_file(seats, tmp_path, capsys, verb):
+    whole = read_join_file(seats.path("first" if verb == "worker" else "coordinator"))
+    path = tmp_path / "edited.join"
+    path.touch(mode=0o600)
+    role = "router" if verb == "router" else whole.role
+    path.write_text(format_join_file(replace(whole, seat=7, role=role)))
+    assert main([verb, "--join", str(path)]) == 1
+    assert f"{whole.role}.{whole.seat}" in capsys.readouterr().err
+    found = [_check_join_file(each) for each in (path, seats.path("first"))]  # by `doctor`
+    assert [(each.ok, each.needed) for each in found] == [(False, True), (True, False)]
+
+
+@pytest.mark.parametrize("role", SEATS)
+def test_the_command_that_an_error_names_issues_a_file(tmp_path, role):
+    Authority.create(tmp_path / "access")
+    words = shlex.split(issue_command(role, "box").replace("FILE", str(tmp_path / "join")))
+    assert main([*words[1:], "--access-dir", str(tmp_path / "access")]) == 0
+    assert read_join_file(tmp_path / "join").role == role
+
+
+@pytest.mark.parametrize("days", [-91, 3])
+def test_a_wrong_clock_is_called_that(seats, tmp_path, days):
+    now = datetime.now(UTC) + timedelta(days=days)
+    issued = seats.authority.issue("viewer", "early", tmp_path / "join", connect=["tls/h.example:1"], now=now)
+    with pytest.raises(AccessError) as refused:
+        check_certificate(issued)
+    assert refused.value.__cause__.verify_code in (NOT_YET_VALID, EXPIRED)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="a filter of Linux's kernel")
+def test_many_unauthenticated_connections_delay_only_new_ones(tmp_path, caplog):
+    authority, port = Authority.create(tmp_path / "access"), free_port()
+    authority.issue("coordinator", "home", tmp_path / "home.join")
+    authority.issue("viewer", "eye", tmp_path / "eye.join", connect=["tls/127.0.0.1:7447"])
+    endpoint = f"tls/127.0.0.1:{port}"
+    viewer = Network(connect=(endpoint,), credentials=read_join_file(tmp_path / "eye.join"))
+    caplog.set_level(logging.WARNING, "dreamfleet.router")
+    home = Network(listen=(endpoint,), credentials=read_join_file(tmp_path / "home.join"))
+    with open_session(home) as router:
+        with open_session(viewer):
+            inside = router.info.transports()
+            for _ in range(2 * MAX_UNAUTHENTICATED):
+                with socket.socket() as link:
+                    link.setblocking(False)
+                    link.connect_ex(("127.0.0.1", port))
+            until(lambda: "crowd" in [getattr(each, "facts", {}).get("event") for each in caplog.records], "no crowd")
+            assert [each.zid for each in router.info.transports()] == [each.zid for each in inside]
+        until(lambda: joined(viewer), "a newcomer is not let in")
+        many = 2 * MAX_UNAUTHENTICATED  # who proves something is no crowd
+        with ExitStack() as fleet, ThreadPoolExecutor(many) as threads:
+            for session in threads.map(lambda _: open_session(viewer, timeout=DEADLINE), range(many)):
+                fleet.enter_context(session)
+            assert joined(viewer)
+    open_session(home).close()  # its port is free
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="descriptors of this process are found in /proc")
+@pytest.mark.parametrize("mode", ["router", "peer"])
+def test_only_seats_that_listen_take_part_as_routers(tmp_path, caplog, mode):
+    authority, port = Authority.create(tmp_path / "access"), free_port()
+    files = {}
+    for role in ("coordinator", "router", "worker"):
+        connect = [] if role == "coordinator" else ["tls/127.0.0.1:7447"]
+        authority.issue(role, role, tmp_path / role, connect=connect)
+        files[role] = read_join_file(tmp_path / role)
+    endpoint = f"tls/127.0.0.1:{port}"
+    caplog.set_level(logging.WARNING, "dreamfleet.router")
+
+    def facts():
+        return [getattr(each, "facts", {}) for each in caplog.records]
+
+    def sessions(whatami):
+        return sum(str(each.whatami) == whatami for each in home.info.transports())
+
+    with ExitStack() as stack:
+        home = stack.enter_context(open_session(Network(listen=(endpoint,), credentials=files["coordinator"])))
+        stack.enter_context(open_session(Network(connect=(endpoint,), credentials=files["worker"])))
+        far = Network(listen=(f"tls/127.0.0.1:{free_port()}",), connect=(endpoint,), credentials=files["router"])
+        stack.enter_context(open_session(far, timeout=None))
+        until(lambda: sessions("router") == 1, "the other router is not linked")
+        settings = zenoh_config(Network(connect=(endpoint,), credentials=files["worker"]), DEADLINE)
+        settings |= {"mode": mode, "listen": {"endpoints": []}}
+        stack.enter_context(zenoh.open(zenoh.Config.from_json5(json.dumps(settings))))
+        until(lambda: any(each.get("identity") == "worker.1" for each in facts()), "it is not noticed")
+        until(lambda: sessions("peer") == 0 and sessions("router") == 1, "it stays")
+        assert sessions("client") == 1
+        assert len(facts()) == 1
+
+
+def joined(network):
+    try:
+        open_session(network).close()
+    except ConnectionFailedError:
+        return False
+    return True

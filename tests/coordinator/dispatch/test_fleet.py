@@ -287,8 +287,7 @@ def test_evaluations_and_drives_fill_a_quarter_of_the_idle_slots_and_lead_where_
     assert len(digests(fleet.dispatch(0.1), A)) == 4
 
 
-def uploading():
-    """A's jobs are done and their uploads are on the way; B is idle."""
+def test_a_job_whose_upload_is_on_its_way_is_not_taken_away_unless_it_never_comes():
     fleet = fleet_of(A, jobs=0)
     fleet.jobs.offer(work(2, "collect"))
     fleet.drain_background = True
@@ -298,24 +297,14 @@ def uploading():
     fleet.defer_verdict(A, second, 1.0)
     fleet.handle_heartbeat(A, beat(seen=1, unacked=[first, second]), 1.0)
     fleet.handle_heartbeat(B, beat(), 1.0)
-    return fleet, first, second
-
-
-def test_a_job_whose_upload_is_on_its_way_is_not_taken_away():
-    fleet, first, second = uploading()
     assert fleet.dispatch(1.0) == []
     assert A in fleet.jobs[first].holders
-    assert fleet.handle_result(A, result(first), 2.0)[0] == "accepted"
-    assert fleet.handle_result(A, result(second), 2.0)[0] == "accepted"
-
-
-def test_an_upload_that_never_comes_is_a_straggler():
-    fleet, *_ = uploading()
     late = 1.1 + UPLOAD_SECONDS
     fleet.handle_heartbeat(A, beat(seen=1, unacked=fleet.members[A].leases), late)
     fleet.handle_heartbeat(B, beat(), late)
     assert len(digests(fleet.dispatch(late), B)) == 1
     assert fleet.counts["copied"] == 1
+    assert [fleet.handle_result(A, result(each), late)[0] for each in (first, second)] == ["accepted"] * 2
 
 
 def test_a_paused_fleet_gives_no_jobs_and_still_judges_results():
@@ -328,9 +317,11 @@ def test_a_paused_fleet_gives_no_jobs_and_still_judges_results():
     assert len(send.verdicts) == 1
 
 
-def test_a_newcomer_takes_over_what_another_worker_has_waiting():
-    fleet = fleet_of(A, capacity=2, jobs=4)
+@pytest.mark.parametrize(("jobs", "taken"), [(4, 0), (2, 2)])  # the second ones wait for slots that another run uses
+def test_a_newcomer_takes_over_what_another_worker_has_waiting(jobs, taken):
+    fleet = fleet_of(A, capacity=2, jobs=jobs)
     given = digests(fleet.dispatch(0.0), A)
+    fleet.handle_heartbeat(A, replace(beat(2, seen=1, queued=given), taken=taken), 0.1) if taken else None
     join(fleet, B, 0.1)
     sends = fleet.dispatch(0.2)
     assert digests(sends, B) == [given[-1]], "what was given last begins last"
@@ -359,32 +350,17 @@ def tail_of_two(pace_a, pace_b, steps_a):
     return fleet, first
 
 
-def test_a_straggler_on_a_slow_host_is_copied_once_and_the_loser_cancelled():
+def test_a_straggler_on_a_slow_host_is_copied_once_to_a_slot_that_no_other_run_uses_and_the_loser_cancelled():
     fleet, job = tail_of_two(pace_a=10.0, pace_b=1000.0, steps_a=100)
+    fleet.handle_heartbeat(B, replace(beat(seen=1), taken=1), 1.0)
+    assert digests(fleet.dispatch(1.0), B) == []
+    fleet.handle_heartbeat(B, beat(seen=1), 1.0)
     assert digests(fleet.dispatch(1.0), B) == [job]
     assert digests(fleet.dispatch(1.1), B) == []
     assert fleet.handle_result(B, result(job), 2.0)[0] == "accepted"
     assert cancelled(fleet.dispatch(2.0), A) == [job]
     assert fleet.counts["copied"] == 1
     assert fleet.counts["discarded_steps"] == 100
-
-
-def test_a_slot_that_another_run_uses_copies_nothing():
-    fleet, job = tail_of_two(pace_a=10.0, pace_b=1000.0, steps_a=100)
-    fleet.handle_heartbeat(B, replace(beat(seen=1), taken=1), 1.0)
-    assert digests(fleet.dispatch(1.0), B) == []
-    fleet.handle_heartbeat(B, beat(seen=1), 1.1)
-    assert digests(fleet.dispatch(1.1), B) == [job]
-
-
-def test_what_waits_for_a_slot_that_another_run_uses_is_taken_over_and_not_copied():
-    fleet = fleet_of(A, capacity=2, jobs=2)
-    given = digests(fleet.dispatch(0.0), A)
-    fleet.handle_heartbeat(A, replace(beat(2, seen=1, queued=given), taken=2), 0.1)
-    join(fleet, B, 0.1)
-    sends = fleet.dispatch(0.2)
-    assert digests(sends, B) == [given[-1]]
-    assert cancelled(sends, A) == [given[-1]]
 
 
 def test_a_job_that_is_nearly_done_is_copied_only_once_its_worker_has_gone_quiet():

@@ -507,13 +507,12 @@ def unproven(begin):
     return bench
 
 
-def test_a_new_host_gets_the_suspects_when_the_only_host_that_has_scored_is_gone(unproven):
-    unproven.serve()
-    assert failed(unproven) == [0, 0, 0]
-
-
-def test_a_new_host_that_fails_them_all_pauses_the_run(unproven):
+def test_a_new_host_gets_the_suspects_when_the_only_host_that_has_scored_is_gone_and_pauses_if_it_fails_all(unproven):
     unproven.fails = lambda job: True
     unproven.serve()
     assert pause_kinds(unproven) == [PauseKind.NO_ABLE_HOST]
     assert unproven.run.generation.failed == []
+    unproven.fails = lambda job: False
+    unproven.run.resume()
+    unproven.serve()
+    assert failed(unproven) == [0, 0, 0]

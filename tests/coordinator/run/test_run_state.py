@@ -28,12 +28,6 @@ SETTLED = [
 ARROW = re.compile(r"^ +(\w+) --> (\w+): (.*) \(([\w, ]+)\)$", re.MULTILINE)
 
 
-def drawn():
-    page = (ROOT / "docs/reference/protocol.md").read_text()
-    section = page.partition("### States of a run\n")[2].partition("\n#")[0]
-    return {(before, each, after) for before, after, _, names in ARROW.findall(section) for each in names.split(", ")}
-
-
 def follow(state, name, number=0):
     """The next state; `None` if there is none."""
     try:
@@ -43,10 +37,13 @@ def follow(state, name, number=0):
 
 
 def test_the_reference_draws_each_transition_and_no_other():
+    page = (ROOT / "docs/reference/protocol.md").read_text()
+    section = page.partition("### States of a run\n")[2].partition("\n#")[0]
+    drawn = {(before, each, after) for before, after, _, names in ARROW.findall(section) for each in names.split(", ")}
     states = [*SETTLED, *(each.stall("", 0.0) for each in SETTLED)]
     arrows = {(type(each).__name__, name, type(then).__name__)
               for each in states for name in TRANSITIONS if (then := follow(each, name)) is not None}  # fmt: skip
-    assert arrows == drawn()
+    assert arrows == drawn
 
 
 @given(st.lists(st.tuples(st.sampled_from(sorted(TRANSITIONS)), st.integers(0, 99))))

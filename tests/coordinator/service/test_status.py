@@ -1,19 +1,22 @@
 """Snapshots of a run and the answers that are cut from them, without a transport.
-Tests service.py, snapshot.py and coordinator/jobs/history.py."""
+Tests run_log.py, service.py, snapshot.py and coordinator/jobs/history.py."""
 
 import dataclasses
 import json
+import socket
 from collections import Counter
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 
 import pytest
 
 from dreamfleet.common.client.equal_fitness import ENOUGH
-from dreamfleet.common.client.status import PARTS, Population, WorkerStatus, read_status
+from dreamfleet.common.client.status import PARTS, EpisodeProgress, Population, Throughput, WorkerStatus, read_status
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, MAX_OPTIONS, Result
 from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
 from dreamfleet.common.schema.validation import from_plain, from_plain_lenient
+from dreamfleet.common.security.credentials import Credentials
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.dispatch.event_log import EventLog
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
@@ -21,7 +24,7 @@ from dreamfleet.coordinator.jobs.generation import CandidateScores
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.run.run import BY_HAND
 from dreamfleet.coordinator.run.run_state import Pause
-from dreamfleet.coordinator.service.run_log import RunLog
+from dreamfleet.coordinator.service.run_log import RunLog, summary, worker_command
 from dreamfleet.coordinator.service.service import next_commit
 from dreamfleet.coordinator.service.snapshot import Snapshot
 from dreamfleet.coordinator.service.status import encode_part, encode_status
@@ -238,3 +241,44 @@ def test_generations_of_one_fitness_are_counted_and_warned_of_once(make_bench, c
 @pytest.mark.parametrize(("took", "waits"), [(0.0, 0.005), (0.001, 0.005), (0.05, 0.05), (0.3, 0.2), (3600.0, 0.2)])
 def test_a_commit_waits_as_long_as_the_last_one_took_and_never_long(took, waits):
     assert next_commit(100.0, 100.0 + took) == pytest.approx(100.0 + took + waits)
+
+
+def test_the_summary_shows_generation_score_speed_workers_and_time_left():
+    status = dataclasses.replace(STATUS, limits={"minutes": 30.0}, throughput=Throughput(987.5, 448000, 1080.0))
+    text, facts = summary(status)
+    parts = "7: 3 of 8 episodes", "120.5 ± 7.8", "988 steps/s", "1 worker", "8 slots", "18 of 30 minutes", "12 min"
+    assert [part for part in parts if part not in text] == []
+    assert (facts["generation"], facts["workers"]) == (7, 1)
+    assert summary(dataclasses.replace(STATUS, best=None))[1]["best"] is None
+
+
+def test_the_summary_counts_failed_candidates():
+    opened = dataclasses.replace(STATUS.generation, failed=1)
+    text, facts = summary(dataclasses.replace(STATUS, failed=2, generation=opened))
+    assert "3 failed candidates" in text
+    assert facts["failed"] == 3
+
+
+def test_no_generation_is_named_once_a_limit_is_reached():
+    confirming = dataclasses.replace(STATUS, state="evaluating", ending=True, confirming=EpisodeProgress(3, 16))
+    for status in (confirming, dataclasses.replace(STATUS, state="paused", ending=True)):
+        assert "generation 7" not in summary(status)[0]
+    assert "3 of 16 episodes" in summary(confirming)[0]
+
+
+def test_the_worker_command_names_an_address_that_other_hosts_reach():
+    assert worker_command(Network(listen=("tcp/127.0.0.1:7447",)), "night", "car-racing") == (
+        "dreamfleet worker --run night --connect tcp/127.0.0.1:7447"
+    )
+    everywhere = worker_command(Network(listen=("tcp/0.0.0.0:7448", "tcp/[::]:7449")), "night", "car-racing")
+    assert everywhere.endswith(f"--connect tcp/{socket.gethostname()}:7448 tcp/{socket.gethostname()}:7449")
+    own = worker_command(Network(listen=("tcp/127.0.0.1:7447",)), "night", "field:FieldTask")
+    assert own.endswith("--connect tcp/127.0.0.1:7447 --task field:FieldTask")
+    assert "--task" not in worker_command(Network(listen=("tcp/127.0.0.1:7447",)), "night", "gym:CartPole-v1")
+    assert "tcp/router:1" in worker_command(Network(connect=("tcp/router:1",)), "night", "car-racing")
+
+
+def test_with_join_files_the_worker_command_names_the_workers_own():
+    credentials = Credentials("coordinator", 1, "home", datetime.now(UTC) + timedelta(days=90), "")
+    command = worker_command(Network(listen=("tls/0.0.0.0:7447",), credentials=credentials), "night", "car-racing")
+    assert command == "dreamfleet worker --run night --join FILE"

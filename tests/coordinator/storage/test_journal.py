@@ -1,5 +1,6 @@
-"""Tests file_watch.py, journal.py, journal_connection.py, journal_file.py, result_records.py, verification_records.py
-and common/runs/records.py."""
+"""What a run keeps, and the results and checks that it takes back, and which of them count again.
+Tests file_watch.py, journal.py, journal_connection.py, journal_file.py, recall_records.py, result_records.py,
+verification_records.py and common/runs/records.py."""
 
 import os
 import shlex
@@ -18,10 +19,11 @@ from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, Stored
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.runs.run_paths import JOURNAL
+from dreamfleet.common.runs.seeds import CHOOSING_OFFSET, validation_seeds
 from dreamfleet.coordinator.jobs.confirmation import Finalist
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.generation import Generation
-from dreamfleet.coordinator.jobs.scoring_job import vector_bytes
+from dreamfleet.coordinator.jobs.scoring_job import make_jobs, vector_bytes
 from dreamfleet.coordinator.storage import file_watch
 from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.coordinator.storage.journal_file import sqlite_side_files
@@ -324,3 +326,152 @@ def test_the_command_that_puts_a_rescued_journal_back_touches_no_other_file(tmp_
     assert [each.read_text() for each in others] == ["another program's"] * 2
     with RunFolder(folder) as run:
         assert run.settings == SETTINGS
+
+
+SEEDS = (1, 2)
+
+
+@pytest.fixture
+def checked(tmp_path, random_bundle):
+    """Two generations whose results are all of host a, and checked by host b."""
+    made = Journal.create(tmp_path / "run", SETTINGS, random_bundle.path)
+    made.begin_incarnation()
+    for number in (0, 1):
+        made.open_generation(number, b"state", 0.1, SEEDS, VECTORS)
+        for work in jobs_of(number):
+            made.results.add(work.job, Result(work.digest, 1.0, 10, 0.1, None, None), "a/1", "f", 1, "class")
+            made.verification.add(work.job, "a/1", "b", "equal")
+    made.commit()
+    yield made
+    made.close()
+
+
+def jobs_of(number):
+    return Generation(number, SPEC, [bytes([number]) + vector[1:] for vector in VECTORS], SEEDS).work
+
+
+def unverified(checked, number):
+    return set(checked.verification.unverified([work.job for work in jobs_of(number)]))
+
+
+def digests_of(number):
+    return {work.digest for work in jobs_of(number)}
+
+
+def test_a_check_does_not_stand_again_by_the_word_of_a_host_that_was_barred(checked):
+    checked.recalls.rewind(0, b"state", SEEDS)
+    checked.recalls.recall({"b"})
+    checked.open_generation(1, b"state", 0.1, SEEDS, VECTORS)
+    checked.recalls.count_again(jobs_of(1))
+    assert set(checked.results.of("score", 1)) == digests_of(1), "what a brought counts again"
+    assert unverified(checked, 0) == digests_of(0)
+    assert unverified(checked, 1) == digests_of(1)
+    checked.verification.unbar("b")
+    checked.recalls.rewind(0, b"state", SEEDS)
+    checked.recalls.count_again(jobs_of(1))
+    assert unverified(checked, 1) == digests_of(1), "nor once it may come again"
+
+
+def test_a_check_stands_again_by_the_word_of_a_host_that_was_not_barred(checked):
+    checked.recalls.rewind(0, b"state", SEEDS)
+    checked.open_generation(1, b"state", 0.1, SEEDS, VECTORS)
+    checked.recalls.count_again(jobs_of(1))
+    assert not unverified(checked, 0)
+    assert not unverified(checked, 1)
+
+
+def test_what_a_dropped_evaluation_had_counts_for_an_earlier_one_of_the_same_mean(checked):
+    last, first = (Evaluation(number, VECTORS[0], 3) for number in (1, 0))
+    seeds = {}
+    for job in (each.job for each in last.work(SPEC)):
+        seeds[job.seeds[0]] = float(job.episode)
+        checked.results.add(job, Result(job.digest, float(job.episode), 10, 0.1, None, None), "a/1", "f", 1, "class")
+        checked.verification.add(job, "a/1", "b", "equal")
+    checked.schedule_evaluation(last)
+    checked.recalls.rewind(0, b"state", SEEDS)
+    checked.schedule_evaluation(first)
+    assert len(checked.fitness_of("evaluate", first.work(SPEC))) == 3
+    checked.finish_evaluation(0, StoredEvaluation(0, 3, 1.0, 0.8), 0)
+    checked.commit()
+    with RunFolder(checked.path.parent) as run:
+        run.verify()
+        assert run.scores(0) == seeds
+    checked.recalls.recall({"b"})
+    assert checked.pending_evaluations() == [first], "its checks are of its generation, too"
+
+
+def test_a_recall_begins_where_a_host_alone_confirmed_what_others_brought(checked):
+    assert checked.recalls.first_brought({"a"}) == checked.recalls.first_brought({"b"}) == {"score": 0}
+    checked.recalls.recall({"b"})
+    assert checked.recalls.first_brought({"b"}) == {}, "its word is gone"
+    for work in jobs_of(1):
+        checked.verification.add(work.job, "a/1", "c", "equal")
+    assert checked.recalls.first_brought({"c"}) == {"score": 1}
+    assert checked.recalls.first_brought({"d"}) == {}
+
+
+def test_an_evaluation_of_which_a_barred_host_alone_confirmed_a_part_is_finished_again(checked):
+    for number, checker in enumerate("bc"):
+        evaluation = Evaluation(number, VECTORS[number], 1)
+        checked.schedule_evaluation(evaluation)
+        (work,) = evaluation.work(SPEC)
+        checked.results.add(work.job, Result(work.digest, 1.0, 10, 0.1, None, None), "a/1", "f", 1, "class")
+        checked.verification.add(work.job, "a/1", checker, "equal")
+        checked.finish_evaluation(number, StoredEvaluation(number, 1, 1.0, 0.0), 0)
+    checked.recalls.recall({"b"})
+    assert [each.generation for each in checked.pending_evaluations()] == [0]
+
+
+def test_who_only_confirmed_the_report_decided_about_no_candidate_and_no_evaluation(checked):
+    checked.schedule_evaluation(Evaluation(0, VECTORS[0], 1))
+    seeds = validation_seeds(2, CHOOSING_OFFSET)
+    scored, failed = (each.job for each in make_jobs(SPEC, "evaluate", 0, 0, VECTORS[0], seeds, first=CHOOSING_OFFSET))
+    checked.results.add(scored, Result(scored.digest, 1.0, 10, 0.1, None, None), "c/1", "f", 1, "class")
+    checked.verification.add(scored, "c/1", "d", "equal")
+    checked.add_failure(failed, Failure("no score", ""), ["e/1"], 1)
+    checked.finish_evaluation(0, StoredEvaluation(0, 1, 1.0, 0.0), 0)
+    for host in "dec":
+        assert checked.recalls.first_brought({host}) == {"confirm": 0}
+        checked.recalls.recall({host})
+        assert not checked.pending_evaluations()
+    assert not checked.read("SELECT 1 FROM failure UNION SELECT 1 FROM result WHERE kind = 'evaluate'")
+
+
+@pytest.mark.parametrize(("barred", "stands"), [("b", True), ("c", True), ("bc", True), ("b c", False)])
+def test_a_check_of_several_hosts_stands_while_one_of_them_is_believed(checked, barred, stands):
+    (work, *_) = jobs_of(0)
+    checked.write("UPDATE verification SET checker = 'b,c', outcome = 'differs' WHERE digest = ?", work.digest)
+    for host in barred.split():
+        checked.recalls.recall({host})
+    assert (work.digest not in unverified(checked, 0)) == stands
+
+
+def test_what_a_closed_race_did_not_want_is_aside_and_counts_again_if_its_generation_opens_again(checked):
+    steps, work = checked.results.effort.steps, jobs_of(1)
+    surplus, *others = [each.digest for each in work]
+    checked.recalls.set_surplus_aside(1, [surplus])
+    assert set(checked.results.of("score", 1)) == set(others)
+    assert checked.results.effort.steps == steps - 10
+    checked.recalls.count_again(work[:1])
+    assert surplus not in checked.results.of("score", 1), "its generation is closed"
+    checked.recalls.rewind(1, b"state", SEEDS)
+    assert set(checked.results.of("score", 1)) == {surplus, *others}
+    assert checked.results.effort.steps == steps
+    assert not unverified(checked, 1)
+
+
+def test_what_a_race_of_a_dropped_generation_did_not_want_counts_again_when_its_job_is_wanted(checked):
+    surplus, *others = [work.digest for work in jobs_of(1)]
+    checked.recalls.set_surplus_aside(1, [surplus])
+    checked.recalls.rewind(0, b"state", SEEDS)
+    checked.recalls.count_again(jobs_of(1))
+    assert set(checked.results.of("score", 1)) == {surplus, *others}
+
+
+def test_what_a_race_did_not_want_of_a_barred_host_never_counts_again(checked):
+    surplus, *_ = [work.digest for work in jobs_of(1)]
+    checked.recalls.set_surplus_aside(1, [surplus])
+    checked.recalls.recall({"a"})
+    checked.recalls.rewind(1, b"state", SEEDS)
+    assert not checked.results.of("score", 1)
+    assert checked.verification.counts()["recalled"] == 8

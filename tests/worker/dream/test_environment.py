@@ -114,12 +114,9 @@ def test_a_dream_is_at_most_as_long_as_an_episode_of_its_world(choices_bundle, r
         environment.reset(seed=1)
         truncated = [environment.step(environment.action_space.sample())[2:4] for _ in range(horizon)]
         assert truncated == [(False, False)] * (horizon - 1) + [(False, True)]
-
-
-def test_another_rule_of_the_end_may_be_given(choices_bundle):
     environment = Dream(choices_bundle, end="0.0")
     environment.reset(seed=1)
-    assert environment.step(1)[1:3] == (0.0, True)
+    assert environment.step(1)[1:3] == (0.0, True), "and as short as its rule says"
 
 
 @pytest.mark.parametrize(

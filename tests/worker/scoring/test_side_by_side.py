@@ -131,6 +131,9 @@ def test_what_is_not_compared_changes_nothing():
         count.add(2, 0, 100.0)  # episodes that are over at once
         count.add(3, 1000, 0.1)  # more than a slot can do
     assert (count.choose(99), count.best) == (1, 2)
+    count = DriveCount()  # of a slot that drives one by one
+    assert drive(count, {1: 3}, 100) == [1] * 100
+    assert count.best == count.most == 1
 
 
 @pytest.mark.parametrize(
@@ -141,9 +144,3 @@ def test_with_few_jobs_a_slot_it_is_found_among_the_numbers_that_can_be(waiting,
     count = counting(4)
     assert drive(count, costs, 4 * ENOUGH, waiting)[::ENOUGH] == asked
     assert drive(count, {4: 1, **costs}, ENOUGH) == [4] * ENOUGH
-
-
-def test_a_slot_that_drives_one_by_one_goes_on_so():
-    count = DriveCount()
-    assert drive(count, {1: 3}, 100) == [1] * 100
-    assert count.best == count.most == 1

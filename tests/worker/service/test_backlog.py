@@ -3,8 +3,7 @@
 import hashlib
 from itertools import pairwise
 
-from hypothesis import given
-from hypothesis import strategies as st
+import pytest
 from msgspec.structs import replace
 
 from dreamfleet.common.protocol.codec import encode
@@ -186,23 +185,17 @@ def drain(uploads, now, seconds):
     return sent
 
 
-@given(st.integers(1, 3 * MAX_PART))
-def test_a_round_is_the_whole_file_in_parts(length):
-    data = bytes(length)
-    uploads = UploadQueue(repeat=100.0)
+@pytest.mark.parametrize("length", [1, MAX_PART, MAX_BURST * MAX_PART + 1])
+def test_a_round_is_the_whole_file_in_parts_and_leaves_in_bursts(length):
+    uploads, data = UploadQueue(repeat=100.0), bytes(length)
     uploads.add(DIGEST, data)
-    parts = [part for _, part in drain(uploads, 0.0, 1.0)]
+    parts = uploads.due(0.0)
+    assert uploads.due(BURST_INTERVAL / 2) == []
+    assert len(parts) == min(-(-length // MAX_PART), MAX_BURST)
+    parts += uploads.due(BURST_INTERVAL)
     assert b"".join(part.data for part in parts) == data
     assert [part.offset for part in parts] == list(range(0, length, MAX_PART))
     assert {(part.total, part.sha256) for part in parts} == {(length, hashlib.sha256(data).digest())}
-
-
-def test_a_large_file_leaves_in_bursts():
-    uploads = UploadQueue(repeat=100.0)
-    uploads.add(DIGEST, bytes((MAX_BURST + 1) * MAX_PART))
-    assert len(uploads.due(0.0)) == MAX_BURST
-    assert uploads.due(BURST_INTERVAL / 2) == []
-    assert len(uploads.due(BURST_INTERVAL)) == 1
 
 
 def test_rounds_come_with_longer_and_longer_pauses_until_the_verdict_on_that_file():

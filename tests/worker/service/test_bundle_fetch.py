@@ -1,6 +1,5 @@
 """Interrupted, damaged and foreign downloads over a real router: parts on disk stay, and the whole file is verified."""
 
-import resource
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -15,6 +14,7 @@ from dreamfleet.common.transport.session import Network, open_session
 from dreamfleet.worker.service import bundle_fetch
 from dreamfleet.worker.service.bundle_fetch import MAX_ATTEMPTS, fetch_bundle
 from tests.support import tasks
+from tests.support.disks import file_size_limit
 from tests.support.hand import DEADLINE, Hand, unknown_sender
 from tests.support.processes import free_port
 
@@ -159,12 +159,9 @@ def test_parts_that_name_another_length_are_ignored(download, monkeypatch):
 
 
 def test_on_a_full_disk_the_parts_stay(download):
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_PART + 100, hard))
-    try:
+    with file_size_limit() as limit:
+        limit(MAX_PART + 100)
         with pytest.raises(BundleError):
             download.fetch()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert download.fetch() == download.content
     assert MAX_PART + 100 in download.asked()

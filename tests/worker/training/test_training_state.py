@@ -395,16 +395,15 @@ def allocator_calls(monkeypatch):
     os.environ.pop("OMP_WAIT_POLICY", None)
 
 
-def test_threads_that_wait_sleep_and_the_heap_keeps_what_is_freed(allocator_calls):
+def test_threads_that_wait_sleep_and_the_heap_keeps_what_is_freed_unless_the_user_set_otherwise(
+    allocator_calls, monkeypatch
+):
     torch_setup.configure_process()
     assert (os.environ["OMP_WAIT_POLICY"], allocator_calls) == ("PASSIVE", ["keep"])
-
-
-def test_what_the_user_set_stays(allocator_calls, monkeypatch):
     monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
     monkeypatch.setenv("MALLOC_ARENA_MAX", "2")
     torch_setup.configure_process()
-    assert (os.environ["OMP_WAIT_POLICY"], allocator_calls) == ("ACTIVE", [])
+    assert (os.environ["OMP_WAIT_POLICY"], allocator_calls) == ("ACTIVE", ["keep"])
 
 
 def test_a_system_without_such_a_heap_is_left_alone(monkeypatch):

@@ -205,16 +205,6 @@ VARIANTS = {
 }
 
 
-def chance(config, rows=ROWS, seed=0):
-    """The inputs of a step besides the temperature."""
-    random = np.random.default_rng(seed)
-    shapes = {"latent": config.latent, "action": config.actions, "state": config.state}
-    feed = {name: random.normal(0, 0.5, (rows, size)).astype(np.float32) for name, size in shapes.items()}
-    feed["uniform"] = random.random((rows, config.latent)).astype(np.float32)
-    feed["normal"] = random.normal(size=(rows, config.latent)).astype(np.float32)
-    return feed
-
-
 def dreamt_in_torch(model, feed, temperature, mask):
     """The same step in torch: softmax, cumulative sum, the first entry beyond `uniform`."""
     config = model.config
@@ -243,7 +233,11 @@ def dreamt_in_torch(model, feed, temperature, mask):
 def test_the_dream_is_what_torch_dreams(tmp_path, name, temperature):
     config = VARIANTS[name]
     eyes = VAEConfig(latent=config.latent)
-    bundle, feed = write_random_bundle(tmp_path / "b.zip", vae=eyes, rnn=config), chance(config)
+    bundle, random = write_random_bundle(tmp_path / "b.zip", vae=eyes, rnn=config), np.random.default_rng(0)
+    shapes = {"latent": config.latent, "action": config.actions, "state": config.state}
+    feed = {name: random.normal(0, 0.5, (ROWS, size)).astype(np.float32) for name, size in shapes.items()}
+    feed["uniform"] = random.random((ROWS, config.latent)).astype(np.float32)
+    feed["normal"] = random.normal(size=(ROWS, config.latent)).astype(np.float32)
     mask = np.float32(1)
     if config.dropout:
         mask = (np.random.default_rng(1).random((ROWS, config.hidden)) > config.dropout) / np.float32(0.8)

@@ -346,15 +346,11 @@ def played(test):
     """A test that is a coroutine, in a loop of its own."""
 
     @wraps(test)
-    def play(looks):
-        asyncio.run(asyncio.wait_for(test(looks), 20))
+    def play():
+        asyncio.run(asyncio.wait_for(test(Looks()), 20))
 
+    del play.__wrapped__  # or pytest looks for a fixture `looks`
     return play
-
-
-@pytest.fixture
-def looks():
-    return Looks()
 
 
 @pytest.mark.slow

@@ -1,5 +1,5 @@
 """Hosts that answer nonsense, print without end or say nothing: each is one row, and the others go on.
-Tests parallel.py and remote_host.py."""
+Tests connection.py, parallel.py and remote_host.py."""
 
 import re
 import resource
@@ -16,6 +16,7 @@ import pytest
 from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.coordinator.addons.spawn import connection, parallel
 from dreamfleet.coordinator.addons.spawn.config import Host, SpawnConfig
+from dreamfleet.coordinator.addons.spawn.connection import NO_PYTHON, Connection, explain
 from dreamfleet.coordinator.addons.spawn.parallel import check
 from dreamfleet.coordinator.addons.spawn.remote_host import FAILED, FleetAddress, HostStatus
 from tests.support.processes import DEADLINE
@@ -89,3 +90,50 @@ def test_a_lost_host_is_said_while_others_work(monkeypatch):
     other.follow = lambda: HostStatus("b", "ended" if said.wait(DEADLINE) else "deaf", "")
     rows = parallel._run_in_threads([lost, other], parallel._follow_until_ended, lambda: False, Mock())
     assert [(row.host, row.state) for row in rows] == [("a", FAILED), ("b", "ended")]
+
+
+KINDS = [
+    "ssh: Could not resolve hostname x: Name or service not known",
+    "ssh: connect to host x port 22: Connection refused",
+    "ssh: connect to host x port 22: Connection timed out",
+    "@ WARNING: REMOTE HOST IDENTIFICATION HAS CHANGED! @\nHost key verification failed.",
+    "No ED25519 host key is known for x.\nHost key verification failed.",
+    "me@x: Permission denied (publickey).",
+    "Error: remote port forwarding failed for listen port 0",
+]
+
+
+def explained(said):
+    return explain(said.splitlines(), 255, "me@x")
+
+
+def test_each_kind_of_error_of_ssh_is_explained_in_a_line_of_its_own():
+    found = {explained(each) for each in KINDS}
+    assert len(found) == len(KINDS)
+    assert not any("\n" in each for each in found)
+
+
+@pytest.mark.parametrize(
+    ("said", "named"),
+    [
+        (f"{NO_PYTHON} Python 3.9.2", "3.9.2"),
+        (f"{NO_PYTHON} sh: 1: python3: not found", "--remote-python"),
+        ("Warning: Permanently added 'x' to the list of known hosts.\nsomething new\n", "(something new)"),
+        ("", "255"),
+    ],
+)
+def test_what_the_host_said_is_named(said, named):
+    assert named in explained(said)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pipes of a connection that ended
+def test_the_ports_of_tunnels_are_read_also_to_an_ipv6_address_which_ssh_names_without_brackets():
+    forwards = ("[::1]:7447", "localhost:1")
+    said = (f"Allocated port {port} for remote forward to {to}" for port, to in ((5, "::1:7447"), (6, "localhost:1")))
+    ssh = ("/bin/sh", "-c", "".join(f"echo {each} >&2; " for each in said) + "exec cat > /dev/null")
+    connection = Connection(ssh, "a", forwards=forwards)
+    try:
+        assert connection.ports(forwards) == [5, 6]
+    finally:
+        connection.close()
+        connection._listener.join(DEADLINE)  # else it holds the pipes until some later test

@@ -1,6 +1,9 @@
-"""Vectors of parameters, and drives, of other programs. Tests drives.py and vectors.py."""
+"""Vectors of parameters, drives, and checkpoints of ctallec/world-models; what people of another project type first.
+Tests checkpoints.py, drives.py, sources.py, vectors.py and verb.py."""
 
 import json
+import re
+import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -15,11 +18,13 @@ from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import ControllerError, DatasetError
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.coordinator.storage.journal import Journal
+from dreamfleet.worker.addons.importing.checkpoints import read_mdnrnn, read_vae
 from dreamfleet.worker.addons.importing.drives import read_drive
 from dreamfleet.worker.addons.importing.vectors import read_vector, to_parameters
 from dreamfleet.worker.training.data.dataset import episode_paths, find_world, kind_of, load_pictures, load_steps
+from dreamfleet.worker.worldmodel.inference import Decoder, DreamStep
 from dreamfleet.worker.worlds.car_racing.preprocessing import BOX
-from tests.support.checkpoint_files import write_drive as ctallec_drive
+from tests.support import checkpoint_files as theirs
 from tests.support.samples import SPEC
 
 
@@ -247,7 +252,7 @@ def test_the_writer_of_the_page_makes_a_data_set(tmp_path, monkeypatch):
 @pytest.mark.parametrize("size", [64, 96])
 def test_drives_of_ctallec_are_shifted_by_a_step(size, tmp_path, capsys):
     source = tmp_path / "carracing"
-    first, _ = (ctallec_drive(source / f"thread_{each}", each, size=size) for each in range(2))
+    first, _ = (theirs.write_drive(source / f"thread_{each}", each, size=size) for each in range(2))
     assert take_in(source, tmp_path / "data") == 0
     assert "ctallec" in capsys.readouterr().out
     path = episode_paths(tmp_path / "data")[0]
@@ -280,7 +285,7 @@ def test_one_drive_is_no_drives(tmp_path):
 
 
 def test_a_layout_may_be_named(tmp_path):
-    np.savez(tmp_path / "x.npz", **ctallec_drive(tmp_path / "thread_0", 0))
+    np.savez(tmp_path / "x.npz", **theirs.write_drive(tmp_path / "thread_0", 0))
     with pytest.raises(DatasetError):
         read_drive(tmp_path / "x.npz")
     assert len(read_drive(tmp_path / "x.npz", layout="ctallec").arrays["picture"]) == 5
@@ -290,7 +295,7 @@ def test_a_layout_may_be_named(tmp_path):
 def test_a_world_model_is_trained_on_drives_of_ctallec(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for each in range(3):
-        ctallec_drive(tmp_path / "carracing" / "thread_0", each, steps=30)
+        theirs.write_drive(tmp_path / "carracing" / "thread_0", each, steps=30)
     assert main(["import", "carracing", "--out", "data"]) == 0
     few = ["--preset", "paper", "--updates", "2"]
     assert main(["train", "vae", "--data", "data", *few]) == 0
@@ -299,3 +304,188 @@ def test_a_world_model_is_trained_on_drives_of_ctallec(tmp_path, monkeypatch):
     assert main(["train", "mdnrnn", "--data", "data", "--set", "joint=true", "done=true", *few]) == 0
     assert main(["bundle", "--data", "data", "--out", "world.zip"]) == 0
     assert Bundle.open(Path("world.zip")).manifest.preprocessing == "whole-64"
+
+
+@pytest.fixture(scope="module")
+def taken_in(tmp_path_factory):
+    """Weights, their files, and the bundle and controller made of them."""
+    folder, weights = tmp_path_factory.mktemp("exp_dir"), theirs.random_weights()
+    theirs.write_checkpoints(folder, weights)
+    world, controller = folder / "world.zip", folder / "controller.npz"
+    assert main(["import", str(folder), "--out", str(world)]) == 0
+    command = ["import", str(folder / "ctrl" / "best.tar"), "--bundle", str(world), "--out", str(controller)]
+    assert main(command) == 0
+    return folder, weights, Bundle.open(world), Controller.load(controller)
+
+
+def test_a_controller_acts_as_in_their_program_and_sees_whole_pictures(taken_in):
+    _, weights, bundle, controller = taken_in
+    assert (bundle.manifest.preprocessing, bundle.manifest.picture) == ("whole-64", (64, 64, 3))
+    assert controller.variant.actions == "linear"
+    pictures = np.random.default_rng(2).integers(0, 256, (20, 64, 64, 3), dtype=np.uint8)
+    wanted = theirs.drive(weights, pictures)
+    state, actions = None, []
+    for each in pictures:
+        action, state = controller.predict(each, state, bundle=bundle)
+        actions.append(action)
+    assert np.abs(np.array(actions) - wanted).max() < 1e-5
+    assert np.ptp(wanted, axis=0).min() > 0.1
+    assert np.abs(wanted).max() > 1  # beyond what the car does: the LSTM sees it as it is
+
+
+def test_the_decoder_draws_their_pictures(taken_in):
+    _, (vae, *_), bundle, _ = taken_in
+    latents = np.random.default_rng(3).normal(0, 1, (3, theirs.LATENT)).astype(np.float32)
+    wanted = np.stack([theirs.decode(vae, each.astype(float)) for each in latents]) * 255
+    found = Decoder(bundle).decode(latents).astype(float)
+    assert np.abs(found - wanted).max() <= 1.5  # its weights have half precision, and it rounds
+    assert np.ptp(wanted) > 50
+
+
+def test_a_dream_draws_all_latents_from_one_gaussian(taken_in):
+    _, (_, rnn, _), bundle, _ = taken_in
+    step, random = DreamStep(bundle), np.random.default_rng(4)
+    latent = random.normal(0, 1, (40, theirs.LATENT)).astype(np.float32)
+    action = random.normal(0, 1, (40, 3)).astype(np.float32)
+    uniform, normal = random.random((2, 40, theirs.LATENT), dtype=np.float32)
+    found = step.imagine(latent, action, step.zero_state(40), uniform, normal, 1.0)
+    chosen = []
+    for row in range(40):
+        means, spreads, logits, reward, end = theirs.Memory(rnn).advance(
+            action[row].astype(float), latent[row].astype(float)
+        )
+        weights = np.exp(logits - logits.max())
+        gaussian = int(np.searchsorted(np.cumsum(weights / weights.sum()), uniform[row, 0], side="right"))
+        wanted = means[gaussian] + spreads[gaussian] * normal[row]
+        assert np.abs(found.latent[row] - wanted).max() < 5e-3  # heads have half precision
+        assert found.reward[row] == pytest.approx(reward, abs=5e-3)
+        assert found.done[row] == pytest.approx(theirs.sigmoid(end), abs=5e-3)
+        chosen.append(gaussian)
+    assert len(set(chosen)) == theirs.MIXTURES
+
+
+def test_old_and_new_files_of_torch_make_the_same_bundle(taken_in, tmp_path):
+    _, weights, bundle, controller = taken_in
+    theirs.write_checkpoints(tmp_path, weights, legacy=True)
+    assert main(["import", str(tmp_path), "--out", str(tmp_path / "world.zip")]) == 0
+    assert Bundle.open(tmp_path / "world.zip").sha256 == bundle.sha256
+    command = ["import", str(tmp_path / "ctrl"), "--bundle", str(tmp_path / "world.zip"), "--out"]
+    assert main([*command, str(tmp_path / "c.npz")]) == 0
+    assert Controller.load(tmp_path / "c.npz").sha256 == controller.sha256
+
+
+def test_a_reward_head_that_was_never_trained_is_left_out(taken_in, tmp_path):
+    _, weights, bundle, _ = taken_in
+    assert bundle.manifest.models["mdnrnn"]["reward"] == "value"
+    theirs.write_checkpoints(tmp_path, weights, with_reward=False)
+    weights, config = read_mdnrnn(tmp_path / "mdrnn" / "best.tar")
+    assert config.reward == "none"
+    with_head, _ = read_mdnrnn(taken_in[0] / "mdrnn" / "best.tar")
+    assert np.array_equal(weights["heads.bias"], np.delete(with_head["heads.bias"], -2))
+
+
+def test_a_part_of_another_shape_is_refused(taken_in, tmp_path):
+    vae, rnn, controller = taken_in[1]
+    bad = {**vae, "encoder.conv2.weight": vae["encoder.conv2.weight"][:, :16]}
+    theirs.write_checkpoints(tmp_path, (bad, {**rnn, "rnn.bias_hh_l0": rnn["rnn.bias_hh_l0"] * np.nan}, controller))
+    with pytest.raises(DatasetError, match=r"\(64, 16, 4, 4\)"):
+        read_vae(tmp_path / "vae" / "best.tar")
+    with pytest.raises(DatasetError, match="bias_hh"):
+        read_mdnrnn(tmp_path / "mdrnn" / "best.tar")
+    with pytest.raises(DatasetError, match="VAE"):
+        read_vae(tmp_path / "ctrl" / "best.tar")
+
+
+WME, ARTICLE, CTALLEC = "log/best.json", "controller/car_racing.cma.4.32.best.json", "exp_dir/ctrl/best.tar"
+DRIVES = ("record", "rollout", "datasets/carracing")
+TRAIN = "train vae --data data --preset paper"
+# What is typed, its exit code, and the command that the answer names, or "" where it is the result.
+TYPED = [
+    *((typed.format(source), 1, f"import {source} --bundle WORLD_MODEL --out controller.npz") for source, typed in (
+        *((source, "evaluate --controller {}") for source in (WME, ARTICLE, CTALLEC)),
+        (WME, "record --controller {} --out x.mp4"),
+        (WME, "coordinator --run x --init {}"),
+        (CTALLEC, "coordinator --run x --init {}"),
+        (WME, "lab refit {} --to tiny --data data --out x.npz"),
+    )),
+    *((f"train vae --data {source}", 1, f"import {source} --out DATA") for source in DRIVES),
+    *((f"import {source} --out data", 0, TRAIN) for source in DRIVES),
+    (f"import {WME} --out x.npz", 2, "import FOLDER --out world.zip"),
+    (f"import {WME} --bundle world.zip --out x.npz", 0, ""),
+    (f"import {ARTICLE} --layout article --bundle world.zip --out x.npz", 0, ""),
+    ("import vae/weights.h5 --out x.zip", 1, "import DRIVES --out DATA"),
+    ("import . --out x.zip", 1, "import DRIVES --out DATA"),
+    ("evaluate --controller exp_dir", 1, "import exp_dir --out OUT"),
+    ("evaluate --controller tiny --bundle exp_dir/vae/best.tar", 1, "import exp_dir --out world.zip"),
+    (f"import {CTALLEC} --out x.npz", 2, "import exp_dir --out world.zip"),
+    ("import exp_dir/vae/best.tar --out x.zip", 1, "import exp_dir --out world.zip"),
+    ("coordinator --run x --task dream --bundle exp_dir", 1, "import exp_dir --out world.zip"),
+    ("import exp_dir --out world.zip", 0, f"import {CTALLEC} --bundle world.zip --out controller.npz"),
+    (f"import {CTALLEC} --bundle world.zip --out x.npz", 0, "evaluate --controller x.npz --bundle world.zip"),
+    ("import exp_dir/ctrl --bundle world.zip --out x.npz", 0, "evaluate --controller x.npz --bundle world.zip"),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def sources(tmp_path_factory):
+    """A folder with the files that the three programs write, and a world model `world.zip`."""
+    folder = tmp_path_factory.mktemp("sources")
+    theirs.write_checkpoints(folder / "exp_dir", theirs.random_weights())
+    assert main(["import", str(folder / "exp_dir"), "--out", str(folder / "world.zip")]) == 0
+    for place in (WME, ARTICLE):
+        (folder / place).parent.mkdir()
+        (folder / place).write_text(json.dumps([np.linspace(-0.2, 0.2, 867).round(4).tolist(), 903.5]))
+    pictures = np.zeros((3, 64, 64, 3), np.uint8)
+    drives = {
+        "record": {"obs": pictures, "action": np.zeros((3, 3), np.float16)},
+        "rollout": {
+            "obs": pictures / np.float32(255), "action": np.zeros((3, 3)), "reward": np.array([-0.1, 7, -0.1]),
+            "done": np.zeros(3, bool),
+        },
+    }  # fmt: skip
+    for place, arrays in drives.items():
+        (folder / place).mkdir()
+        for number in (1520837, 934721):
+            np.savez_compressed(folder / place / f"{number}.npz", **arrays)
+    for number in range(2):
+        theirs.write_drive(folder / "datasets" / "carracing" / f"thread_{number}", number)
+    for part in ("vae", "rnn"):
+        (folder / part).mkdir()
+        (folder / part / "weights.h5").write_bytes(b"\x89HDF\r\n\x1a\n")
+    return folder
+
+
+@pytest.mark.parametrize(("typed", "code", "named"), TYPED)
+def test_a_first_command_ends_in_its_result_or_names_the_command(
+    typed, code, named, sources, tmp_path, monkeypatch, capsys
+):
+    for path in sources.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    if "--out world.zip" in typed:
+        (tmp_path / "world.zip").unlink()
+    monkeypatch.chdir(tmp_path)
+    assert main(shlex.split(typed)) == code
+    answer = "".join(capsys.readouterr())
+    assert f"`dreamfleet {named}" in answer
+    assert "Traceback" not in answer
+    if code and not {"FOLDER", "DRIVES", "OUT"} & set(named.split()):  # what it names does it
+        command = re.search(r"`dreamfleet (import [^`]*)`", answer)[1]
+        assert main(shlex.split(command.replace("WORLD_MODEL", "world.zip").replace("--out world", "--out again"))) == 0
+        assert written_by(command.split()[-1].replace("world", "again"), tmp_path)
+
+
+def written_by(name, folder):
+    """What a command wrote, opened as its next user opens it."""
+    path = folder / name
+    if name.endswith(".npz"):
+        return Controller.load(path).shape.size == 867
+    return Bundle.open(path).manifest.latent == 32 if name.endswith(".zip") else any((path / "episodes").iterdir())
+
+
+def test_no_file_of_the_source_is_replaced(sources, monkeypatch, capsys):
+    monkeypatch.chdir(sources)
+    before = (sources / "exp_dir/vae/best.tar").read_bytes()
+    assert main(["import", "exp_dir", "--out", "exp_dir/vae/best.tar"]) == 2
+    assert main(["import", CTALLEC, "--bundle", "world.zip", "--out", CTALLEC]) == 2
+    assert CTALLEC in capsys.readouterr().err
+    assert (sources / "exp_dir/vae/best.tar").read_bytes() == before

@@ -19,44 +19,27 @@ from tests.support.bundles import write_world_bundle
 from tests.support.pixel_fakes import MODULE
 from tests.support.watching import Watching
 
-KINDS = pytest.mark.parametrize("kind", ["Single", "Shared"])
 SHAPE = ControllerShape(2, 3)
 
 
-def name_of(kind):
-    return f"gym:{MODULE}:{kind}-v0"
-
-
-@KINDS
-def test_a_slot_scores_and_is_watched(kind):
-    scorer = Scorer(TaskSpec(name_of(kind), "", 1000, 0, SHAPE))
-    assert scorer.host_class
-    assert scorer.side_by_side == 1
+@pytest.mark.parametrize("kind", ["Single", "Shared"])
+def test_it_is_checked_scored_watched_judged_filmed_collected_and_scored_by_a_world_model(kind, tmp_path):
+    name = f"gym:{MODULE}:{kind}-v0"
+    *_, found = dry_run(name, {"normalise": True}, lambda _step: None, thorough=True)
+    assert found.episode == found.repeated != ""
+    assert "normal" in json.loads(found.description.options)
+    assert found.warnings == ()
+    scorer = Scorer(TaskSpec(name, "", 1000, 0, SHAPE))
+    assert (bool(scorer.host_class), scorer.side_by_side) == (True, 1)
     parameters = np.linspace(-1, 1, SHAPE.size, dtype=np.float32)
     plain = scorer.score("score", parameters, 7)
     scorer.observer = Watching()
     assert scorer.score("score", parameters, 7) == plain
     assert len(scorer.observer) == plain.steps > 9
     scorer.close()
-
-
-@KINDS
-def test_the_check_before_a_run_finds_nothing(kind):
-    *_, found = dry_run(name_of(kind), {"normalise": True}, lambda _step: None, thorough=True)
-    assert found.episode == found.repeated != ""
-    assert "normal" in json.loads(found.description.options)
-    assert found.warnings == ()
-
-
-@KINDS
-def test_a_controller_is_evaluated_and_recorded(kind, tmp_path):
-    agent = make_agent(Controller(SHAPE, np.zeros(SHAPE.size, np.float32), name_of(kind), ""))
+    agent = make_agent(Controller(SHAPE, np.zeros(SHAPE.size, np.float32), name, ""))
     (episode,) = evaluate(agent, (7,), jobs=1)
     assert record(agent, 7, episode.steps, tmp_path / "drive.mp4")[0] == episode.score
-
-
-@KINDS
-def test_pictures_are_collected_and_a_world_model_scores(kind, tmp_path):
     options = '{"observation": "render"}'
     task = GymTask(f"{MODULE}:{kind}-v0").with_options(options)
     arrays = drive_episode(CollectConfig(episodes=1, steps=10, anywhere=0), 0, world=DataWorld(task.name, options))
