@@ -1,7 +1,11 @@
-"""The key by which a worker shows that it is on the coordinator's own host: a file that only their user can read."""
+"""The key by which a worker shows that it is on the coordinator's own host: a file that only their user can read.
+
+Hosts may share a home, and so the file: their keys differ by what each host knows of itself.
+"""
 
 import hmac
 import os
+import platform
 import secrets
 import stat
 from contextlib import suppress
@@ -12,6 +16,7 @@ from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.files.regular_files import open_regular
 
 NAME, BYTES = "host.key", 32
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # Linux: drawn as the machine starts
 
 
 def make_host_key() -> bytes:
@@ -48,9 +53,17 @@ def _path() -> Path:
 
 
 def _read() -> bytes:
-    """The key; empty if there is none, or if another user made or may read it, as in a cache that users share."""
+    """This host's key; empty if there is none, or if another user made or may read the file, as in a shared cache."""
     with suppress(OSError, DreamfleetError), open_regular(_path(), BYTES) as file:
         found = os.fstat(file.fileno())
         if found.st_uid == os.geteuid() and not found.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
-            return file.read()
+            kept = file.read()
+            return hmac.digest(kept, _machine().encode(), "sha256") if len(kept) == BYTES else b""
     return b""
+
+
+def _machine() -> str:
+    """What no other machine has: the one of this start, or elsewhere than on Linux the host's name."""
+    with suppress(OSError):
+        return BOOT_ID.read_text().strip()
+    return platform.node()

@@ -81,8 +81,8 @@ class ControllerWriter:
         self._due = True
 
     def finish(self) -> None:
-        """The run ends: what it reports now must be saved."""
-        self._due = True
+        """The run ends: what it reports now must be saved, also if only the receipt has changed."""
+        self._saved, self._due = None, True
 
     def save(self, *, at_once: bool = False) -> None:
         """Save the controller if it is due; with `at_once`, whenever the file holds another one."""

@@ -11,14 +11,17 @@ from __future__ import annotations
 
 import ipaddress
 import json
+import os
 import re
 import secrets
+import stat
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from shlex import quote
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
@@ -46,12 +49,13 @@ class Authority:
     """A certificate authority in its folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Open an existing authority; `AccessError` if there is none, or it is damaged."""
+        """Open an existing authority; `AccessError` if there is none, it is damaged, or others may change it."""
         self._folder = folder
         if _KEY not in _parts(folder):
             raise AccessError(
                 f"no authority in {folder}: `dreamfleet access init` creates one, --access-dir names another"
             )
+        _check_mine(folder)
         try:
             self._pem = read_text(folder / _CERTIFICATE, _MAX_FILE_BYTES)
             self._certificate = x509.load_pem_x509_certificate(self._pem.encode())
@@ -77,6 +81,7 @@ class Authority:
         pem = _certify(name, name, key, key, x509.random_serial_number(), now, now + timedelta(days=AUTHORITY_DAYS))
         with reporting_write_errors(folder, "--access-dir"):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _check_mine(folder)
         with reporting_write_errors(folder, "--access-dir"), _locked(folder):
             _check_vacant(folder)
             try:
@@ -199,6 +204,25 @@ def _check_vacant(folder: Path) -> None:
     """`UsageError` if a folder holds an authority, or a part of one: a copy of its list, or all but its key."""
     if found := _parts(folder):
         raise UsageError(f"{folder} holds {', '.join(found)} of an authority already: name another --access-dir")
+
+
+def _check_mine(folder: Path) -> None:
+    """`AccessError` if other users own or may write the folder or a file of the authority, or may read its secrets."""
+    for path in (folder, *(folder / each for each in _parts(folder))):
+        found = path.stat()
+        if found.st_uid not in (os.geteuid(), 0):
+            raise AccessError(
+                f"{path} is another user's: make an authority in a folder of yours, --access-dir names it"
+            )
+        refused = (
+            stat.S_IWOTH if found.st_gid == os.geteuid() else stat.S_IWOTH | stat.S_IWGRP
+        )  # a private group writes
+        if path.name in (_KEY, _SECRET):
+            refused = stat.S_IRWXG | stat.S_IRWXO
+        if found.st_mode & refused:
+            raise AccessError(
+                f"others may change or read {path}: chmod go= {quote(str(path))}; if they did, make another authority"
+            )
 
 
 @contextmanager

@@ -329,6 +329,28 @@ def test_commands_at_once_wait_for_each_other(access, tmp_path):
     assert failures == [UsageError] * 7, "a file is written once"
 
 
+@pytest.mark.parametrize(("name", "mode"), [("", 0o702), ("ca.key", 0o640), ("ca.key", 0o604), ("issued.json", 0o602)])
+def test_an_authority_that_others_may_change_issues_nothing(tmp_path, name, mode):
+    folder = tmp_path / "access"
+    folder.mkdir()
+    if not name:
+        folder.chmod(mode)
+        with pytest.raises(AccessError, match=re.escape(str(folder))):
+            Authority.create(folder)
+        folder.chmod(0o700)
+    Authority.create(folder)
+    path = folder / name
+    path.chmod(mode)
+    with pytest.raises(AccessError, match=re.escape(str(path))):
+        Authority(folder)
+    path.chmod(0o700)
+    Authority(folder)
+    if os.geteuid() == 0:  # who alone gives files away
+        os.chown(path, 65534, -1)
+        with pytest.raises(AccessError, match=re.escape(str(path))):
+            Authority(folder)
+
+
 def test_an_existing_authority_is_not_overwritten_even_in_a_race(tmp_path, monkeypatch):
     folder = tmp_path / "access"
     begun = authority._certify

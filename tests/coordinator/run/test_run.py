@@ -19,6 +19,7 @@ from dreamfleet.common.runs.lookup import find_controller
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import CONTROLLER
+from dreamfleet.common.runs.run_provenance import read_run_provenance
 from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.jobs.rollout_collection import NOT_KEPT
@@ -231,6 +232,18 @@ def test_a_run_that_resumes_beyond_its_limit_writes_the_controller_and_the_reaso
     assert bench.saved() is not None
     with RunFolder(bench.path) as stored:
         assert stored.ended == "3 generations"
+
+
+def test_an_ended_runs_receipt_counts_its_last_evaluation_also_if_another_is_better(make):
+    bench = make(replace(EVALUATED, confirm_episodes=0), generations=4)
+    while bench.run.state.ended is None:
+        bench.now += SAVE_INTERVAL  # so that it is saved as each generation closes
+        bench.step()
+    found = bench.saved()
+    with RunFolder(bench.path) as stored:
+        assert found.provenance["generation"] == 1
+        assert (received := read_run_provenance(found)).generations == len(stored.history()) == 4
+        assert received.effort == stored.total_effort()
 
 
 def test_an_open_run_has_a_controller_once_a_generation_is_closed(make):
