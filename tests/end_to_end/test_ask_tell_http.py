@@ -9,7 +9,6 @@ import base64
 import json
 import math
 import re
-import signal
 import socket
 import subprocess
 import sys
@@ -268,8 +267,7 @@ def test_the_bridge_may_start_before_its_coordinator(processes, random_bundle):
     process.wait_for("http://")
     stopped = processes.start("serve", "--connect", f"tcp/127.0.0.1:{free_port()}", "--port", 0)
     stopped.wait_for("WARNING")
-    stopped.popen.send_signal(signal.SIGTERM)
-    assert stopped.finish()[0] == 0
+    assert stopped.stop()[0] == 0
 
 
 def test_malformed_requests_fill_no_log(processes):
@@ -279,8 +277,7 @@ def test_malformed_requests_fill_no_log(processes):
         with socket.create_connection(("127.0.0.1", bridge.port), timeout=DEADLINE) as made:
             made.sendall(b"\x16\x03\x01\xff\r\n\r\n")
             assert b"400" in made.recv(4096)
-    bridge.process.popen.send_signal(signal.SIGTERM)
-    bridge.process.finish()
+    bridge.process.stop()
     assert sum("WARNING" in line for line in bridge.process.lines) == 1
 
 

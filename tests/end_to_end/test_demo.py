@@ -4,7 +4,6 @@ Tests dreamfleet/experiments/demo.py and dreamfleet/experiments/verbs/demo.py.
 """
 
 import os
-import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -112,8 +111,7 @@ def test_stopped_without_a_page_it_had_none_leaves_nobody_and_says_how_to_go_on(
         assert demo.popen.poll() is None
     started = psutil.Process(demo.popen.pid).children()
     words = [each.cmdline() for each in started]
-    demo.popen.send_signal(signal.SIGTERM)
-    assert demo.finish()[0] == 130
+    assert demo.stop()[0] == 130
     assert "--resume demo-dream" in demo.last_line()
     assert not any(runs(each.pid) for each in started)
     assert not any("dashboard" in each for each in words)

@@ -4,7 +4,6 @@ Tests coordinator/storage/file_watch.py and coordinator/storage/served_bundle.py
 import os
 import shlex
 import shutil
-import signal
 import sqlite3
 import subprocess
 import sys
@@ -95,8 +94,7 @@ def test_a_controller_whose_name_is_a_folder_is_a_clear_error(processes, live):
     coordinator, folder = live
     (folder / "controller.npz").unlink(missing_ok=True)
     (folder / "controller.npz").mkdir()
-    coordinator.popen.send_signal(signal.SIGTERM)
-    assert coordinator.finish()[0] == 1
+    assert coordinator.stop()[0] == 1
     assert "controller.npz" in coordinator.lines[-1]
     assert "Traceback" not in "".join(coordinator.lines)
     (folder / "controller.npz").rmdir()

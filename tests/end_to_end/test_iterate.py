@@ -337,8 +337,7 @@ def test_one_iteration_works_in_a_folder_and_ctrl_c_ends_all_that_it_started(pro
     process = processes.start(*words(layout.root))
     until_exists(layout.root / "episodes", process)
     processes.refused(str(layout.root), *words(layout.root))
-    process.popen.send_signal(signal.SIGINT)
-    assert process.finish()[0] == 130
+    assert process.stop(signal.SIGINT)[0] == 130
     assert f"iterate --data {layout.root}" in process.last_line()
     assert not left(layout.root)
 
@@ -369,8 +368,7 @@ def test_a_stopped_contrast_continues_and_compares_the_kinds(processes, data, tm
     words = ("lab", "contrast", "--data", data, "--out", tmp_path / "out", "--seeds", 1, *CONTRASTED)
     first = processes.start(*words)
     first.wait_for("plain-1")
-    first.popen.send_signal(signal.SIGTERM)
-    code, _ = first.finish()
+    code, _ = first.stop()
     assert code == 130, first.lines
 
     answer = json.loads(processes.printed(*words, "--json"))

@@ -94,8 +94,7 @@ def test_the_verb_writes_its_frames_when_it_is_stopped(processes, run, tmp_path)
     live.wait_for("test")
     while len(list((tmp_path / "stills").glob("*.png"))) < 3:
         pass
-    live.popen.send_signal(signal.SIGINT)
-    code, out = live.finish()
+    code, out = live.stop(signal.SIGINT)
     assert code == 0
     assert json.loads(out)["pictures"] >= 3
 

@@ -30,8 +30,7 @@ def test_a_json_log_is_json_and_says_how_to_start_a_worker(processes, small):
     coordinator.wait_for_event("generation", number=0, level="info")
     coordinator.popen.kill()
     worker.wait_for_event("coordinator gone", run="test")
-    worker.popen.terminate()
-    assert worker.finish()[0] == 0
+    assert worker.stop()[0] == 0
 
 
 @pytest.mark.slow
@@ -106,8 +105,7 @@ def test_curves_go_on_after_a_kill_and_stall_nothing(processes, small, monkeypat
         life.end()
         life = processes.resume()
     life.wait_for_event("generation", times=3)
-    life.popen.send_signal(signal.SIGTERM)
-    life.finish()
+    life.stop()
     last = processes.resume("test", "--minutes", "0.001")
     assert last.finish()[0] == 0
     with RunFolder(processes.runs / "test") as run:

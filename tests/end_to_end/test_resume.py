@@ -3,7 +3,6 @@ Tests coordinator/settings/start.py."""
 
 import json
 import shutil
-import signal
 import subprocess
 import sys
 
@@ -21,8 +20,7 @@ def stopped(processes, *flags):
     coordinator = processes.coordinator(*flags)
     worker = processes.worker("--task", tasks.SLOW_TOY)
     coordinator.wait_for_event("generation", number=1)
-    coordinator.popen.send_signal(signal.SIGTERM)
-    assert coordinator.finish()[0] == 130
+    assert coordinator.stop()[0] == 130
     return worker, coordinator.lines[-1]
 
 
@@ -64,8 +62,7 @@ def test_a_run_moves_to_another_place_and_its_worker_follows(processes, small):
     parts = processes.coordinator(*small, "--generations", 4, name="parts")
     worker = processes.start("worker", "--connect", first, second, "--slots", 1, "--task", tasks.SLOW_TOY)
     parts.wait_for_event("generation", number=1)
-    parts.popen.send_signal(signal.SIGTERM)
-    assert parts.finish()[0] == 130
+    assert parts.stop()[0] == 130
     elsewhere = processes.folder / "elsewhere"
     shutil.copytree(processes.runs / "parts", elsewhere / "parts")
     again = processes.start("coordinator", "--resume", "parts", "--runs-dir", elsewhere, "--listen", second)
@@ -108,8 +105,7 @@ def test_a_start_outlives_a_coordinator_that_was_killed_at_once_and_its_own_file
     start.unlink()
     again = processes.resume("night")
     again.wait_for_event("begin")
-    again.popen.send_signal(signal.SIGTERM)
-    assert again.finish()[0] == 130
+    assert again.stop()[0] == 130
     with open_run(processes.runs, "night") as run:
         population = np.stack([run.candidate(0, number) for number in range(4)])
         assert np.abs(population - mean).max() < 10 * SIGMA

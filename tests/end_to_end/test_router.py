@@ -2,7 +2,6 @@
 Tests common/addons/router/verb.py."""
 
 import json
-import signal
 import tomllib
 from pathlib import Path
 
@@ -61,8 +60,7 @@ def test_two_linked_routers_one_of_which_is_killed_cost_no_bit(processes, recipe
     router.end()
     processes.start("router", "--config", first).wait_for_event("begin")
     assert coordinator.finish()[0] == 0
-    linked.popen.send_signal(signal.SIGTERM)
-    assert linked.finish()[0] == 0
+    assert linked.stop()[0] == 0
     assert linked.events("sessions")[-1]["routers"] == 1
     assert outcome(processes, "far") == alone
 

@@ -164,8 +164,7 @@ def test_a_frozen_predecessor_that_comes_back_leaves_and_its_token_hurts_nobody(
     with open_session(Network(listen=(processes.endpoint,))):
         words = ("--connect", processes.endpoint)
         made = start(processes, "a", "--run", "test", *words, *small)
-        made.popen.send_signal(signal.SIGTERM)
-        made.finish()
+        made.stop()
         old = start(processes, "a", "--resume", "test", *words)
         shutil.copytree(processes.folder / "a", processes.folder / "b")
         old.popen.send_signal(signal.SIGSTOP)

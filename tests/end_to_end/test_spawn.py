@@ -87,8 +87,7 @@ def test_through_a_tunnel_workers_serve_a_coordinator_on_loopback_and_end_with_t
     refused = rows_of(processes, *spawn, code=1)["a"]
     assert refused["state"] == "failed"
 
-    command.popen.send_signal(signal.SIGINT)
-    code, out = command.finish()
+    code, out = command.stop(signal.SIGINT)
     assert code == 0, "".join(command.lines)
     assert "left" in out
     assert not process_start(pid)
@@ -111,8 +110,7 @@ def test_a_log_is_followed_until_the_worker_ends_or_somebody_has_seen_enough(pro
     own = ("--worker-flags", f"--task {tasks.TOY} --exit-when-done --coordinator-timeout 15")
     command = processes.start("spawn", "a", *words(hosts, *flags, *own))
     coordinator.wait_for_event("generation", number=1)
-    command.popen.send_signal(signal.SIGINT)
-    assert command.finish()[0] == 0, "".join(command.lines)
+    assert command.stop(signal.SIGINT)[0] == 0, "".join(command.lines)
     assert process_start(pid_on(a))
 
     command = processes.start("spawn", "a", *words(hosts, *flags, *own))
@@ -176,8 +174,7 @@ def test_ctrl_c_while_hosts_are_brought_up_ends_the_command_and_not_what_others_
     slow.chmod(0o755)
     command = processes.start("spawn", "a", "--ssh", hosts.ssh, "--remote-python", slow)
     until(asked.exists)
-    command.popen.send_signal(signal.SIGINT)
-    assert command.finish()[0] == 130
+    assert command.stop(signal.SIGINT)[0] == 130
 
 
 @pytest.mark.slow

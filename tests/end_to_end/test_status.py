@@ -81,8 +81,7 @@ def test_a_live_runs_controller_is_fetched_and_judged_on_another_host(processes,
             client.controller("test")
         worker = processes.worker("--task", tasks.TOY)
         coordinator.wait_for_event("generation", number=3)
-        worker.popen.send_signal(signal.SIGTERM)
-        assert worker.finish()[0] == 0
+        assert worker.stop()[0] == 0
         with open_run(processes.runs, "test") as run:
             closed = len(run.history())
             here = Controller.load(run.controller_path)

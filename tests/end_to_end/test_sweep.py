@@ -84,8 +84,7 @@ def test_of_two_that_begin_at_once_one_goes_on_and_ctrl_c_ends_it_in_order(proce
     copy = processes.start("sweep", "--resume", "toys", "--runs-dir", processes.runs)
     assert copy.finish()[0] == 2
     assert str(processes.runs) in copy.last_line()
-    served.popen.send_signal(signal.SIGINT)
-    assert served.finish()[0] == 130
+    assert served.stop(signal.SIGINT)[0] == 130
     assert "--resume toys" in served.last_line()
     for seed in (1, 2):
         with open_run(processes.runs, f"toys-seed{seed}") as run:

@@ -53,8 +53,7 @@ def test_a_run_of_two_stages_from_a_controller_is_repeated_through_a_kill_and_a_
     again = processes.start(*words)
     processes.worker("--task", tasks.TOY, "--run", "kept-again")
     again.wait_for_event("generation", number=1)
-    again.popen.send_signal(signal.SIGINT)
-    code, out = again.finish()
+    code, out = again.stop(signal.SIGINT)
     assert code == 130
     assert shlex.split(json.loads(out)["continue"])[-len(words) :] == [*map(str, words)]
     again = processes.start(*words)

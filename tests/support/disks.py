@@ -31,22 +31,36 @@ class SmallDisk:
     def free(self):
         self._ballast.unlink(missing_ok=True)
 
-    def remove(self):
-        _run("umount", "--lazy", self.path)
-
 
 @contextmanager
-def small_disk(path, megabytes):
-    """A disk, or `None` if this process may not mount one."""
+def _mounted(mount, path):
+    """What `mount` gives for this path, which is unmounted at the end; `None` if this process may not mount."""
     try:
-        disk = SmallDisk(path, megabytes)
+        made = mount(path)
     except (OSError, subprocess.CalledProcessError):
         yield None
         return
     try:
-        yield disk
+        yield made
     finally:
-        disk.remove()
+        _run("umount", "--lazy", path)
+
+
+def small_disk(path, megabytes):
+    """A disk, or `None` if this process may not mount one."""
+    return _mounted(lambda path: SmallDisk(path, megabytes), path)
+
+
+def read_only_view(folder, path):
+    """The same files at `path`, where nobody can write, while `folder` stays writable; `None` without the right."""
+
+    def mount(path):
+        path.mkdir()
+        _run("mount", "--bind", folder, path)
+        _run("mount", "-o", "remount,bind,ro", path)
+        return path
+
+    return _mounted(mount, path)
 
 
 @contextmanager
@@ -57,22 +71,6 @@ def file_size_limit():
         yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-@contextmanager
-def read_only_view(folder, path):
-    """The same files at `path`, where nobody can write, while `folder` stays writable; `None` without the right."""
-    path.mkdir()
-    try:
-        _run("mount", "--bind", folder, path)
-        _run("mount", "-o", "remount,bind,ro", path)
-    except (OSError, subprocess.CalledProcessError):
-        yield None
-        return
-    try:
-        yield path
-    finally:
-        _run("umount", "--lazy", path)
 
 
 def _run(*words):

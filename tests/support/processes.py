@@ -6,6 +6,7 @@ import json
 import os
 import queue
 import select
+import signal
 import socket
 import subprocess
 import threading
@@ -174,6 +175,11 @@ class Process(VerbProcess):
 
     def finish(self, timeout=DEADLINE):
         return super().finish(timeout)
+
+    def stop(self, number=signal.SIGTERM):
+        """Send a signal, and wait for the end: exit code and stdout."""
+        self.popen.send_signal(number)
+        return self.finish()
 
     def end(self, timeout=0):
         """End it at once, without a grace period by default."""

@@ -132,27 +132,22 @@ def run_sweep(folder, *words):
     return sweep_verb.run(args)
 
 
-@pytest.mark.parametrize("flags", CODE_FLAGS)
-def test_a_kept_sweep_chooses_no_code(folder, flags, monkeypatch):
-    monkeypatch.setattr(sweep_verb, "_serve", lambda *_args: pytest.fail("it was served"))
-    folder.write(StoredSweep(sweep_of("seed=1", flags=(*flags, "--generations=1")), ()))
-    with pytest.raises(UsageError, match=r"--trust (pickle|mine)"):
-        run_sweep(folder, "--resume", "carts")
-
-
 @pytest.mark.parametrize(
-    "stored",
+    ("sweep", "announced", "said"),
     [
-        StoredSweep(sweep_of("seed=1"), ("function:pickle:loads",)),
-        StoredSweep(sweep_of("seed=1", "task=function:pickle:loads", flags=FLAGS[1:]), ()),
-        StoredSweep(sweep_of("seed=1", flags=(*FLAGS, "--config", "strangers.toml")), ()),
-        StoredSweep(sweep_of("seed=1", flags=(*FLAGS, "--join=strangers")), ()),
+        *((sweep_of("seed=1", flags=(*each, "--generations=1")), (), "--trust (pickle|mine)") for each in CODE_FLAGS),
+        (sweep_of("seed=1"), ("function:pickle:loads",), "."),
+        (sweep_of("seed=1", "task=function:pickle:loads", flags=FLAGS[1:]), (), "."),
+        (sweep_of("seed=1", flags=(*FLAGS, "--config", "strangers.toml")), (), "."),
+        (sweep_of("seed=1", flags=(*FLAGS, "--join=strangers")), (), "."),
     ],
 )
-def test_a_kept_sweep_announces_no_code_and_names_no_file_of_settings(folder, stored, monkeypatch):
+def test_a_kept_sweep_chooses_and_announces_no_code_and_names_no_file_of_settings(
+    folder, sweep, announced, said, monkeypatch
+):
     monkeypatch.setattr(sweep_verb, "_serve", lambda *_args: pytest.fail("it was served"))
-    folder.write(stored)
-    with pytest.raises(UsageError):
+    folder.write(StoredSweep(sweep, announced))
+    with pytest.raises(UsageError, match=said):
         run_sweep(folder, "--resume", "carts")
 
 
