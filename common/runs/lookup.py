@@ -32,6 +32,7 @@ from dreamfleet.common.runs.records import best_evaluation
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, resume_command, run_command, run_paths
 from dreamfleet.common.runs.run_provenance import RECEIPT, judged_facts
+from dreamfleet.common.schema.validation import to_plain
 
 SUBSPACES = "subspaces"  # the folder of shipped subspaces: of a world model, by its name, or of a controller
 
@@ -90,7 +91,9 @@ def load_controller_of(run: RunFolder) -> Controller:
             return found
         provenance = found.provenance | {"generation": judged.generation, **judged_facts(judged)}
         if isinstance(receipt := provenance.get(RECEIPT), dict):
-            provenance[RECEIPT] = receipt | {"generations": len(run.history())}
+            checks = {} if run.checks is None else {"checks": to_plain(run.checks)}
+            kept = {name: value for name, value in receipt.items() if name != "checks"}
+            provenance[RECEIPT] = kept | {"generations": len(run.history())} | checks
         return replace(found, parameters=run.evaluated_mean(judged.generation), provenance=provenance)
 
 

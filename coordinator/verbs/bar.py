@@ -34,6 +34,7 @@ def run(args: argparse.Namespace) -> int:
     from dreamfleet.common.errors import ConnectionFailedError
     from dreamfleet.common.files.regular_files import is_file
     from dreamfleet.common.protocol.keys import check_run_name, check_worker_name
+    from dreamfleet.common.runs.run_folder import RunFolder
     from dreamfleet.common.runs.run_lock import is_run_locked
     from dreamfleet.common.runs.run_paths import JOURNAL, resume_command
     from dreamfleet.coordinator.run.recall import bar_stored
@@ -51,7 +52,8 @@ def run(args: argparse.Namespace) -> int:
                 sleep(PAUSE)
                 continue
             bar_stored(folder, host, is_barred=not args.no_longer)
-            then = {"continue": resume_command(folder)}
+            with RunFolder(folder) as stored:
+                then = {} if stored.ended else {"continue": resume_command(folder)}
         break
     done = "may join again" if args.no_longer else "is barred, and what it brought is scored again"
     text = "".join(f"; continue the run with: {each}" for each in then.values())

@@ -46,8 +46,8 @@ class RemoteScorer(Displayed):
     ...         scorer.score(np.zeros((2, scorer.size)), seeds=[1, 2]).shape
     (2,)
 
-    `timeout` is how many seconds it waits for a coordinator that does not answer, because it was killed and is being
-    resumed. Then, and if the address is wrong, `ConnectionFailedError`.
+    `timeout` is how many seconds its batches wait for a coordinator that answered before, and was killed and is being
+    resumed. Then, and where no coordinator answers at first, `ConnectionFailedError`.
     """
 
     def __init__(self, connect: Network | tuple[str, ...] | str, run: str, *, timeout: float = TIMEOUT) -> None:

@@ -17,13 +17,17 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.subspace import Subspace
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.errors import ConnectionFailedError, ControllerError, DreamfleetError, UsageError
+from dreamfleet.common.protocol.check_counts import CheckCounts
 from dreamfleet.common.runs import lookup
+from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.runs.lookup import find_controller, find_subspace, naming_the_stored_run
 from dreamfleet.common.runs.paired_difference import PairedDifference
 from dreamfleet.common.runs.records import StoredConfirmation, StoredEvaluation, describe_score, format_mean, with_error
 from dreamfleet.common.runs.run_paths import CONTROLLER
+from dreamfleet.common.runs.run_provenance import RunProvenance, read_run_provenance
 from dreamfleet.common.runs.standard_error import format_with_error, sample_std, standard_error
+from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.coordinator.addons.runs.stored_run import open_run
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.freezing import freeze
@@ -373,11 +377,14 @@ def test_where_no_coordinator_answers_the_stored_run_is_named(tmp_path, random_b
 
 def test_a_controller_that_lags_behind_the_journal_is_the_one_that_the_journal_reports(runs):
     written = Controller.load(runs / "reality" / CONTROLLER)
-    old = replace(written, parameters=written.parameters + 1, provenance=written.provenance | {"generation": 0})
+    receipt = RunProvenance(1, Effort(), checks=CheckCounts(0.0, barred=("let in again since",)))
+    facts = {"generation": 0, "receipt": to_plain(receipt)}
+    old = replace(written, parameters=written.parameters + 1, provenance=written.provenance | facts)
     old.save(runs / "reality" / CONTROLLER)
     for name, folder in (("reality", runs), (str(runs / "reality"), runs / "elsewhere")):
         found, _ = find_controller(name, folder)
         assert (found.sha256, found.provenance | written.provenance) == (written.sha256, found.provenance)
+        assert read_run_provenance(found).checks is None
     with open_run("reality", runs) as run:
         assert run.controller().sha256 == written.sha256
     assert json.loads(printed("runs", "receipt", "reality", "--json"))["controller"] == written.sha256
