@@ -129,7 +129,7 @@ class Run:
         self._settle_failures()
         self.verification.settle(now)
         if self.verification.has_findings:
-            if self._take_lock():
+            if not self.state.is_leaving and self._take_lock():  # the next incarnation has the same checked again
                 self._rewind(self.verification.condemn)
             return False
         self.background_jobs.settle()

@@ -117,6 +117,12 @@ class RunState:
         return self.settled if isinstance(self.settled, Paused) else None
 
     @property
+    def is_leaving(self) -> bool:
+        """Whether this incarnation goes as soon as its workers are done, or gone: only what they do is of interest."""
+        leaving = {PauseKind.DRAINING, PauseKind.DISBANDING}
+        return self.paused is not None and not leaving.isdisjoint(each.kind for each in self.paused.pauses)
+
+    @property
     def stalled(self) -> Stalled | None:
         """What `recover` ends; `None` if the journal can be written."""
         return self if isinstance(self, Stalled) else None

@@ -176,7 +176,9 @@ def _serve_incarnation(request: RunRequest, stop: Stop, kept: _Kept) -> Run:
         if stop.is_requested:
             service.stop()
         try:
-            return service.serve(open_run)
+            run = service.serve(open_run)
+            stop.is_requested = stop.is_requested or service.is_asked_to_stop
+            return run
         except JournalError as error:
             was_refused = isinstance(error.__cause__, (OSError, sqlite3.OperationalError))
             if not was_refused or journal is None or not journal.is_whole:

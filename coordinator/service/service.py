@@ -90,12 +90,13 @@ class Service:
         self._inbox = CountingDecoder()
         self._error_counter = ErrorCounter(log)
         self._stopping = False
+        self.is_asked_to_stop = False  # by somebody, so no other incarnation goes on
         self._commit_at = 0.0  # before that a commit waits for further results
         self._has_uncommitted = False  # whether the last turn left its commit to a later one
 
     def stop(self) -> None:
         """End the loop soon; the run can be continued. Safe in a signal handler."""
-        self._stopping = True
+        self._stopping = self.is_asked_to_stop = True
         self._events.wake()
 
     def serve(self, open_run: Callable[[], OpenRun]) -> Run:

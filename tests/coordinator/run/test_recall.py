@@ -19,6 +19,7 @@ from dreamfleet.coordinator.optimisers.evolution import Evolution
 from dreamfleet.coordinator.run.failure_policy import LIMIT_FROM
 from dreamfleet.coordinator.run.generations import Generations
 from dreamfleet.coordinator.run.recall import bar_stored, recall
+from dreamfleet.coordinator.service.control import DRAINING
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 from tests.support import run_bench
@@ -140,6 +141,30 @@ def test_what_a_candidate_has_that_failed_for_a_while_is_checked_once_it_is_scor
     checked = "SELECT digest FROM verification WHERE stands AND outcome = 'equal'"
     assert len(bench.journal.read(scored)) == 24
     assert not bench.journal.read(f"{scored} EXCEPT {checked}")
+    bench.journal.close()
+
+
+class Departing(Lying):
+    """Each result arrives while the coordinator drains, which is taken back again."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, hosts=(A, B, "c/1"), **kwargs)
+        self.admit("c/1")
+        self.found = 0
+
+    def answer_one(self, name, job):
+        self.run.pause(DRAINING)
+        super().answer_one(name, job)
+        self.found += self.run.verification.has_findings
+        assert not self.run.state.is_rewound
+        self.run.resume()
+
+
+def test_a_coordinator_that_leaves_leaves_also_if_a_host_is_found_wrong(begin, monkeypatch):
+    monkeypatch.setattr(run_bench, "NetworkConfig", partial(NetworkConfig, verify=1.0))
+    bench = begin(kind=Departing)
+    bench.serve(stop=lambda run: run.state.is_rewound)
+    assert bench.found
     bench.journal.close()
 
 
