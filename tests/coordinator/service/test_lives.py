@@ -2,6 +2,7 @@
 coordinator/verbs/bar.py."""
 
 from contextlib import nullcontext
+from itertools import product
 from types import SimpleNamespace
 
 import pytest
@@ -24,8 +25,8 @@ from tests.support.failing_runs import SETTINGS, finished
 LEDGERS = {"missing": lambda path: path.unlink(), "half copied": lambda path: path.write_bytes(path.read_bytes()[:99])}
 
 
-@pytest.mark.parametrize("ledger", LEDGERS)
-def test_the_next_life_keeps_the_lock_and_the_revoked_seats(tmp_path, random_bundle, monkeypatch, ledger):
+@pytest.mark.parametrize(("ledger", "asked"), [*product(LEDGERS, [False]), ("missing", True)])
+def test_the_next_life_keeps_the_lock_and_the_revoked_seats(tmp_path, random_bundle, monkeypatch, ledger, asked):
     bench = finished(tmp_path / "runs", random_bundle, fails=lambda _: False)
     bench.run.leave()
     bench.journal.close()
@@ -42,14 +43,14 @@ def test_the_next_life_keeps_the_lock_and_the_revoked_seats(tmp_path, random_bun
 
     def serve(open_run):
         run = open_run().run
-        if len(seats) == 1:
+        if len(seats) == 1:  # as it is asked to stop, or not
             assert run.bar("a") == ""
             LEDGERS[ledger](access.folder / LEDGER_FILE)
         return run
 
     def service(name, network, intervals, metrics_port, revocations, word):
         seats.append(revocations.revoked_seats)
-        return SimpleNamespace(stop=lambda: None, serve=serve)
+        return SimpleNamespace(stop=lambda: None, serve=serve, is_asked_to_stop=asked)
 
     monkeypatch.setattr(main, "_resolve_settings", resolve)
     monkeypatch.setattr(main, "Service", service)
@@ -58,9 +59,9 @@ def test_the_next_life_keeps_the_lock_and_the_revoked_seats(tmp_path, random_bun
         credentials=read_join_file(access.path("coordinator")), access_dir=access.folder,
     )  # fmt: skip
     run = main.serve_run(request)
-    assert not run.state.is_rewound
+    assert run.state.is_rewound == asked
     assert list(run.admission.barred) == ["a"]
-    assert seats == [revoked, revoked]
+    assert seats == [revoked] * (1 if asked else 2)
     with run_lock(bench.path):
         pass
 
