@@ -101,13 +101,15 @@ class _ConnectionLimiter:
         """Close the connections of sessions that route, but have no seat that may."""
         routing = {str(each.zid) for each in self._info.transports() if str(each.whatami) != "client"}
         links = [each for each in self._info.links() if str(each.zid) in routing] if routing else []
-        seats = {each.dst: each.auth_identifier for each in links if not _may_route(each.auth_identifier)}
+        seats = {_end(each.dst.partition("/")[2]): each.auth_identifier
+                 for each in links if not _may_route(each.auth_identifier)}  # fmt: skip
         if not seats:
             return
+        self._links_changed = True  # until they are gone
         self._blocked_until = monotonic() + FALSE_ROUTER_BLOCK
         for number in self._port_descriptors():
             with suppress(OSError), _as_socket(number) as found:
-                if _remote_end(found) in seats:
+                if _end("[{}]:{}".format(*found.getpeername()[:2])) in seats:
                     found.shutdown(socket.SHUT_RDWR)
         for seat in set(seats.values()) - self._warned:
             text = f"{seat} takes part as a router, which it may not: its connections are closed, and new ones wait"
@@ -154,10 +156,10 @@ def _may_route(seat: str | None) -> bool:
     return seat is None or seat.partition(".")[0] in LISTENERS  # None: by a password, of which Zenoh says nothing
 
 
-def _remote_end(connection: socket.socket) -> str:
-    """The other side of a connection, as Zenoh writes it."""
-    host, port = connection.getpeername()[:2]
-    return f"tls/[{host}]:{port}" if ":" in host else f"tls/{host}:{port}"
+def _end(address: str) -> tuple[str, str]:
+    """Host and port; of a link-local host without its interface, which Zenoh and Python write differently."""
+    host, _, port = address.rpartition(":")
+    return host.strip("[]").partition("%")[0].removeprefix("::ffff:"), port
 
 
 def _local_port(number: int) -> int:

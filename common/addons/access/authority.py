@@ -161,6 +161,11 @@ class Authority:
         name, authority = _x509_name(who.identity), self._certificate.subject
         return _certify(name, authority, key, self._key, serial, min(now, who.expires), who.expires, more)
 
+    @property
+    def uses_passwords(self) -> bool:
+        """Whether the files of coordinators and routers hold the secret that gives all passwords."""
+        return bool(self._secret)
+
     @contextmanager
     def _locked_ledger(self) -> Iterator[CertificateLedger]:
         with ExitStack() as stack:

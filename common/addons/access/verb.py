@@ -122,11 +122,14 @@ def revoke_join_files(args: argparse.Namespace) -> int:
     """Revoke a name's join files, and print from when on that holds."""
     from dreamfleet.common.addons.access.authority import Authority
 
-    found = Authority(args.global_config.access_dir).revoke(args.name, args.role)
+    authority = Authority(args.global_config.access_dir)
+    found = authority.revoke(args.name, args.role)
     role, identity = found[0].role, found[0].identity
     soon = "a coordinator with this --access-dir counts nothing of it from now on (2 s); " if role == "worker" else ""
     text = f"{role} {args.name} ({identity}) is revoked: {soon}routers let it do nothing from their next start on"
-    print_answer(args, text, name=args.name, role=role, identity=identity, files=len(found))
+    if gives_all := authority.uses_passwords and role in LISTENERS:
+        text += ". Its file gives all passwords of the fleet: if somebody else has it, make another authority"
+    print_answer(args, text, name=args.name, role=role, identity=identity, files=len(found), gives_all=gives_all)
     return 0
 
 

@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
-from itertools import count
+from itertools import count, product
 from pathlib import Path
 from threading import Event
 
@@ -31,7 +31,7 @@ from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import AccessError, ConnectionFailedError, DreamfleetError, UsageError
 from dreamfleet.common.security import certificate_ledger
 from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, CertificateLedger, RevocationWatcher
-from dreamfleet.common.security.connection_limiter import MAX_UNAUTHENTICATED
+from dreamfleet.common.security.connection_limiter import MAX_UNAUTHENTICATED, _end
 from dreamfleet.common.security.credentials import (
     MAX_BYTES,
     SEATS,
@@ -225,6 +225,15 @@ def test_the_verbs_create_list_and_revoke(tmp_path, capsys):
         assert "--host" in capsys.readouterr().err
     assert access("issue", "coordinator", "home", "--host", "h.example", "--out", f"{out}2") == 0
     assert (read_join_file(f"{out}2").role, read_join_file(f"{out}2").connect) == ("coordinator", ())
+
+
+def test_a_revoked_listener_of_a_fleet_with_passwords_is_said_to_know_them_all(tmp_path, capsys):
+    for passwords, role in product((True, False), ("router", "worker")):
+        folder, out = tmp_path / f"{passwords}", tmp_path / f"{passwords}-{role}.join"
+        authority = Authority(folder) if folder.exists() else Authority.create(folder, passwords=passwords)
+        authority.issue(role, role, out, connect=HERE)
+        assert main(["access", "revoke", role, "--json", "--access-dir", str(folder)]) == 0
+        assert json.loads(capsys.readouterr().out)["gives_all"] == (passwords and role == "router")
 
 
 def test_an_authority_with_foreign_parts_issues_nothing(tmp_path):
@@ -497,6 +506,11 @@ def test_only_seats_that_listen_take_part_as_routers(tmp_path, caplog, mode):
         until(lambda: sessions("peer") == 0 and sessions("router") == 1, "it stays")
         assert sessions("client") == 1
         assert len(facts()) == 1
+
+
+def test_an_end_of_a_connection_is_the_same_however_its_interface_is_written():
+    assert _end("[fe80::1%eth0]:5") == _end("[fe80::1%4]:5") == ("fe80::1", "5")
+    assert _end("[::ffff:127.0.0.1]:5") == _end("[127.0.0.1]:5") == _end("127.0.0.1:5") == ("127.0.0.1", "5")
 
 
 def joined(network):
