@@ -48,7 +48,7 @@ class ComparedRun:
     @classmethod
     def of(cls, run: RunFolder) -> ComparedRun:
         """Read a run's journal."""
-        with run.read_transaction():
+        with run.verified_transaction():
             evaluations, confirmed = run.evaluations(), run.confirmation()
             evaluated_means = tuple(
                 EvaluatedMean(each.generation, point, run.scores(each.generation))

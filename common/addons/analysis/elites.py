@@ -134,7 +134,7 @@ def find_elite(runs_dir: Path, name: str, cell: str) -> tuple[Controller, Path, 
 
     `UsageError` for a run without an archive.
     """
-    with open_run(runs_dir, name) as run, run.read_transaction():
+    with open_run(runs_dir, name) as run, run.verified_transaction():
         archive = RunArchive.needed(run)
         elite = archive.find(cell)
         return controller_of(run, elite), run.bundle_path, archive.describe_elite(elite)

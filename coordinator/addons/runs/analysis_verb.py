@@ -51,7 +51,7 @@ def plot_runs(args: argparse.Namespace) -> int:
     with ExitStack() as stack:
         runs = [stack.enter_context(open_run(args.runs_dir, name)) for name in dict.fromkeys(args.run_names)]
         for each in runs:
-            stack.enter_context(each.read_transaction())
+            stack.enter_context(each.verified_transaction())
         if kind == "learning" and len(worlds := sorted({world_of(each) for each in runs})) > 1:
             note = f"these runs are in different worlds ({', '.join(worlds)}): their scores do not compare"
             print(f"note: {note}", file=sys.stderr)

@@ -115,7 +115,7 @@ class StoredRun(RunFolder, Displayed):
         _import("matplotlib", install_command("views"))
         from dreamfleet.coordinator.addons.runs.plot import draw_runs
 
-        with self.read_transaction():
+        with self.verified_transaction():
             return draw_runs([self], kind)
 
     def _to_frame(self, package: str, table: str) -> Any:

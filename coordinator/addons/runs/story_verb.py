@@ -93,7 +93,7 @@ def _print_live(args: argparse.Namespace) -> int:
 
 
 def _print_journal(args: argparse.Namespace) -> int:
-    with open_run(args.runs_dir, args.run_name) as stored, stored.read_transaction():
+    with open_run(args.runs_dir, args.run_name) as stored, stored.verified_transaction():
         events, failures = stored.events(), stored.failures()
     events = events[-(args.last or len(events) or 1) :]
     if args.json:

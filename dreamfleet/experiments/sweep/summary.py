@@ -77,7 +77,7 @@ def read_results(runs_dir: Path, runs: Sequence[SweepRun]) -> list[RunResult]:
 
 def read_result(runs_dir: Path, name: str, setting: str) -> RunResult:
     """What a run has reached, under the name of its setting."""
-    with open_run(runs_dir, name) as stored, stored.read_transaction():
+    with open_run(runs_dir, name) as stored, stored.verified_transaction():
         return _read(stored, setting)
 
 

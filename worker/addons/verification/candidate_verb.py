@@ -6,6 +6,7 @@ import math
 import re
 import sys
 from dataclasses import replace
+from statistics import fmean
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from dreamfleet.worker.service.config import WorkerConfig
 
 SUMMARY = "score a run's candidate again and compare with the journal, bit by bit on a host of the same class"
 EXTRAS = ("worker",)
+TOLERANCE = 1e-6  # of the largest score: a mean's rounding is far smaller, a change that matters larger
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -45,12 +47,15 @@ def run(args: argparse.Namespace) -> int:
         device = load(WorkerConfig, "worker", **args.sources).torch_device
         episodes = list(replay(stored, int(found[1]), int(found[2]), torch_device=device))
         stored_fitness, spec = stored.fitness(int(found[1]), int(found[2])), stored.spec
+    scored = [each.stored for each in episodes if each.stored is not None]
+    rounding = TOLERANCE * max(map(abs, scored), default=0.0)
+    is_mean = stored_fitness is None or (bool(scored) and abs(fmean(scored) - stored_fitness) <= rounding)
     if not episodes:
         raise JournalError(f"candidate {args.candidate} of run {args.run_name} has no results yet")
     agree = [each.agrees(args.tolerance) for each in episodes]
     unchecked = agree.count(None)
     if args.json:
-        same = all(each.same for each in episodes)
+        same = is_mean and all(each.same for each in episodes)
         fitness = [each.replayed for each in episodes if each.replayed is not None]
         mean = float(np.mean(fitness)) if len(fitness) == len(episodes) else None
         rows = [{**vars(each), "failure": _text(each.failure), "error": _text(each.error)} for each in episodes]
@@ -70,7 +75,9 @@ def run(args: argparse.Namespace) -> int:
     elif unchecked:
         print(f"{unchecked} of {count} {'was' if unchecked == 1 else 'were'} scored by hosts of another class, which "
               "this host cannot check bit by bit; --tolerance N compares them", file=sys.stderr)  # fmt: skip
-    return 0 if False not in agree and True in agree else 1
+    if not is_mean:
+        print("its fitness in the journal is not the mean of its results: the journal was changed", file=sys.stderr)
+    return 0 if is_mean and False not in agree and True in agree else 1
 
 
 def _in_values(each: ReplayedEpisode, task: TaskSpec) -> ReplayedEpisode:
