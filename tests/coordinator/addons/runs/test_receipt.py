@@ -605,3 +605,11 @@ def test_what_a_fork_inherited_is_named(runs):
     fork = side(runs / "reality")
     assert re.search(r"\b5k .* 0\.0025 ", fork.spent)
     assert fork.total.steps > fork.inherited.steps == 5000
+
+
+@pytest.mark.parametrize("words", [("compare", "reality", "hidden"), ("runs", "plot", "reality"), ("story", "reality")])
+def test_no_answer_is_made_of_a_damaged_journal(runs, tmp_path, words):
+    out = ("--out", tmp_path / "a.png") if "plot" in words else ()
+    assert call_here(*words, *out)[0] == 0
+    change_journal(runs / "reality", "DELETE FROM strategy")  # whose state before the last generation belongs there
+    assert call_here(*words, *out)[0] == 1
