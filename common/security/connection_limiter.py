@@ -88,7 +88,7 @@ class _ConnectionLimiter:
                     self._close_waiting(listening)
         if blocked:
             self._close_spare()
-            if self._unauthenticated > MAX_UNAUTHENTICATED:
+            if monotonic() >= self._blocked_until:  # that of a false router was said
                 text = f"more than {MAX_UNAUTHENTICATED} connections are unauthenticated: new ones wait"
                 log_event(log, "crowd", text, level=logging.WARNING, unproven=self._unauthenticated)
         else:

@@ -630,11 +630,12 @@ def end(host_folder: HostFolder, request: dict[str, Any]) -> dict[str, Any]:
                 channel.send("say", f"worker {name} leaves")
             found.end(channel, STOP_AT_ONCE if request["now"] else STOP_DRAINED)
             remove_tree(found.folder)
-        if ours and not host_folder.names("workers") and not request["keep"]:
+        stay = host_folder.names("workers") if ours else []
+        if ours and not stay and not request["keep"]:
             host_folder.remove()
     if left:
         raise FailedError("; ".join(left))
-    return {"ended": ended}
+    return {"ended": ended, "stay": stay}
 
 
 ACTIONS: dict[str, Callable[[HostFolder, dict[str, Any]], dict[str, Any]]] = {

@@ -127,6 +127,12 @@ class Connection:
             with suppress(OSError):  # what was not read is lost with it
                 self._child.popen.stdin.close()
 
+    def release(self) -> None:
+        """Close the connection once nobody reads from it any more."""
+        self.close()
+        assert self._child.popen.stdout is not None
+        self._child.popen.stdout.close()
+
     def _send(self, *data: bytes) -> None:
         assert self._child.popen.stdin is not None
         with suppress(BrokenPipeError, ValueError):  # `_answer` reports why
@@ -211,6 +217,7 @@ class Connection:
                 if (found := _PORT.search(text)) and (forward := self._forwards.get(found[2])):
                     self._ports[forward] = int(found[1])
                 self._changed.notify_all()
+        self._child.popen.stderr.close()
         with self._changed:
             self._changed.notify_all()
 

@@ -25,7 +25,9 @@ def check(hosts: Sequence[Host], fleet_address: FleetAddress) -> list[HostStatus
 
 def end(hosts: Sequence[Host], *, all_workers: bool, now: bool, keep: bool) -> list[HostStatus]:
     """End the worker of each host, or all workers there, and remove their files."""
-    return _run_on_all(hosts, FleetAddress(()), partial(RemoteHost.end, all_workers=all_workers, now=now, keep=keep))
+    known = {each.name for each in hosts}
+    do = partial(RemoteHost.end, all_workers=all_workers, now=now, keep=keep, known=known)
+    return _run_on_all(hosts, FleetAddress(()), do)
 
 
 def bring_up(
@@ -92,7 +94,7 @@ def _opened(
             for each in hosts
         ]
         for remote_host in remote_hosts:
-            stack.callback(remote_host.close)
+            stack.callback(remote_host.release)
         yield remote_hosts, stop
 
 

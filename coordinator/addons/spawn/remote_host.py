@@ -5,8 +5,9 @@ A host that answers in another form fails alone.
 
 import hashlib
 import json
+import shlex
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -57,9 +58,10 @@ class FollowAnswer(WorkerAnswer):
 
 @dataclass(frozen=True)
 class EndAnswer:
-    """The workers that `end` ended, as they were before."""
+    """The workers that `end` ended, as they were before, and the names of others that are there."""
 
     ended: tuple[WorkerAnswer, ...]
+    stay: tuple[Name, ...]
 
 
 @dataclass(frozen=True)
@@ -156,21 +158,29 @@ class RemoteHost:
         if self._connection is not None:
             self._connection.interrupt()
 
-    def end(self, *, all_workers: bool, now: bool, keep: bool) -> HostStatus:
-        """End its worker, or all workers there, and remove their files."""
+    def end(self, *, all_workers: bool, now: bool, keep: bool, known: Collection[str] = ()) -> HostStatus:
+        """End its worker, or all workers there, and remove their files; name those that stay, but for `known` ones."""
         if self._connection is None:
             self._connect(())
         names = None if all_workers else [self.host.name]
-        ended = self._ask("end", EndAnswer, names=names, now=now, keep=keep).ended
-        if left := [each.name for each in ended if each.running]:
-            return HostStatus(self.host.name, "left", f"{', '.join(left)} left")
-        return HostStatus(self.host.name, "nothing", "no worker runs there")
+        answer = self._ask("end", EndAnswer, names=names, now=now, keep=keep)
+        stay = ", ".join(each for each in answer.stay if known and each not in known)
+        more = f"; {stay} is there too: `dreamfleet down {shlex.quote(self.host.address)}` ends all" if stay else ""
+        if left := [each.name for each in answer.ended if each.running]:
+            return HostStatus(self.host.name, "left", f"{', '.join(left)} left{more}")
+        return HostStatus(self.host.name, "nothing", f"no worker of this name runs there{more}")
 
     def close(self) -> None:
         """Close the connection, which ends a worker that uses its tunnel. From any thread."""
         self._closed.set()
         if self._connection is not None:
             self._connection.close()
+
+    def release(self) -> None:
+        """As `close`, once no method of this host runs."""
+        self.close()
+        if self._connection is not None:
+            self._connection.release()
 
     def _connect(self, forwards: tuple[str, ...]) -> None:
         spawn = self.host.spawn

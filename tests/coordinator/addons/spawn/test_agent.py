@@ -62,7 +62,7 @@ def test_a_foreign_folder_is_left_alone(tmp_path, capsys, names):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
     said = answer(ending({"root": tmp_path}), capsys)
-    assert "rm -rf" in said["failed"] if "made" in names else said["ok"] == {"ended": []}
+    assert "rm -rf" in said["failed"] if "made" in names else said["ok"] == {"ended": [], "stay": []}
     assert "--remote-dir" in answer({"do": "start", "root": str(tmp_path), "name": "box"}, capsys)["failed"]
     assert all(path.exists() for path in kept)
 
@@ -152,7 +152,7 @@ def test_a_removal_that_was_interrupted_at_its_last_step_is_finished(tmp_path, c
     for name in FOLDERS:
         (host_folder.root / name).rmdir()
     (host_folder.root / CREATED).unlink()
-    assert answer(ending({"root": host_folder.root}), capsys)["ok"] == {"ended": []}
+    assert answer(ending({"root": host_folder.root}), capsys)["ok"] == {"ended": [], "stay": []}
     assert not host_folder.root.exists()
 
 
@@ -161,7 +161,7 @@ def test_an_end_that_waited_for_a_removal_leaves_nothing(tmp_path, monkeypatch, 
     with host_folder.locked():
         pass
     remove_meanwhile(monkeypatch)
-    assert answer({**ending({"root": host_folder.root}), "keep": True}, capsys)["ok"] == {"ended": []}
+    assert answer({**ending({"root": host_folder.root}), "keep": True}, capsys)["ok"] == {"ended": [], "stay": []}
     assert not host_folder.root.exists()
 
 
@@ -287,6 +287,8 @@ def test_a_worker_is_this_hosts_after_the_host_is_renamed(started, capsys, monke
     asked, folder, pid = started
     monkeypatch.setattr(platform, "node", lambda: "renamed")
     assert answer(asked, capsys)["ok"]["outcome"] == "running"
+    others = {**ending(asked), "names": ["another"]}
+    assert answer(others, capsys)["ok"] == {"ended": [], "stay": [asked["name"]]}
     assert [each["running"] for each in answer(ending(asked), capsys)["ok"]["ended"]] == [True]
     assert agent.process_start(pid) == ""
     assert not folder.parents[1].exists()
