@@ -128,7 +128,7 @@ def revoke_join_files(args: argparse.Namespace) -> int:
     soon = "a coordinator with this --access-dir counts nothing of it from now on (2 s); " if role == "worker" else ""
     text = f"{role} {args.name} ({identity}) is revoked: {soon}routers let it do nothing from their next start on"
     if gives_all := authority.uses_passwords and role in LISTENERS:
-        text += ". Its file gives all passwords of the fleet: if somebody else has it, make another authority"
+        text += ". Its file gives all passwords of the fleet: if another has it, make another authority"
     print_answer(args, text, name=args.name, role=role, identity=identity, files=len(found), gives_all=gives_all)
     return 0
 
