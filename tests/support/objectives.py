@@ -29,6 +29,10 @@ def raising(_x):
     return 1 // 0
 
 
+def brittle(x, seed):
+    return sphere(x) if seed % 4 else 1 // 0
+
+
 def exiting(_x):
     sys.exit(3)
 

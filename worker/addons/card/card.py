@@ -92,9 +92,10 @@ def _write_script(contents: card_page.CardContents, folder: Path) -> None:
     make_agent(controller, bundle)  # trusts the module of an own run
     task = find_scored_task(controller.task, None) if bundle is None else task_of(bundle)
     script = task.find_standalone_script(Assignment(make_evaluation_spec(controller, bundle), bundle))
-    if script is not None:
-        contents.install = card_page.read_install_command(script)
-        shutil.copyfile(script, folder / card_page.SCRIPT)
+    if script is None:
+        raise UsageError("no program of one file drives with such observations or actions")
+    contents.install = card_page.read_install_command(script)
+    shutil.copyfile(script, folder / card_page.SCRIPT)
 
 
 def _film(contents: card_page.CardContents, path: Path, steps: int, on_step: Callable[[int], None], stop: Stop) -> None:

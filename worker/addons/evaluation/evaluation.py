@@ -27,6 +27,7 @@ from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition, score
 from dreamfleet.worker.scoring.failure_cause import crash, failure_of
 from dreamfleet.worker.tasks.api import Score, World
 from dreamfleet.worker.tasks.closing import close_environment
+from dreamfleet.worker.worlds.function.task import ObjectiveError
 
 Episode = EpisodeResult | FailedEpisode
 log = logging.getLogger(__name__)
@@ -195,7 +196,7 @@ class _Driver:
         self._evaluator: AgentEvaluator | None = None
 
     def drive(self, seed: int) -> Episode:
-        """Drive one whole episode; a `DreamfleetError` passes through, as it concerns all of them."""
+        """Drive one whole episode; a `DreamfleetError` passes through, as it concerns all, but for a function's own."""
         try:
             if self._evaluator is None:
                 self._evaluator = AgentEvaluator(self._agent)
@@ -205,6 +206,8 @@ class _Driver:
             if rejection is None:
                 return found
             why = rejection.text
+        except ObjectiveError as error:
+            why = str(error)
         except DreamfleetError:
             raise
         except self._caught as error:  # a simulator may raise anything

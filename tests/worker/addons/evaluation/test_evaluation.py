@@ -19,6 +19,7 @@ from dreamfleet import make_environment, make_policy
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
+from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.errors import BundleError, ControllerError, DreamfleetError, UsageError
 from dreamfleet.common.host.fingerprint import fingerprint
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
@@ -36,7 +37,7 @@ from dreamfleet.worker.scoring import episode
 from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition
 from dreamfleet.worker.tasks.api import Score, World
 from dreamfleet.worker.tasks.registry import find_task
-from tests.support import rough_tasks, tasks
+from tests.support import objectives, rough_tasks, tasks
 from tests.support.processes import DEADLINE, call_here, environment
 from tests.support.variants import controller_of
 
@@ -86,6 +87,14 @@ def test_scores_are_those_of_the_evaluation_environment(agent):
 def test_an_error_in_a_process_ends_the_evaluation_with_the_reason(agent, task, error, named):
     with pytest.raises(error, match=named):
         EpisodeResults.of(evaluate(agent(task), SEEDS, 2))
+
+
+def test_a_functions_call_that_raises_is_a_failed_episode():
+    options = Objective.of({"x0": [1.0, 2.0], "scale": 1.0, "minimise": True}).options
+    task = f"function:{objectives.__name__}:brittle"
+    controller = Controller(ControllerShape(0, 2), np.zeros(2, np.float32), task, "", options=options)
+    found = EpisodeResults.of(evaluate(make_agent(controller), range(8), 1))
+    assert ([each.seed for each in found.failed], len(found.drives)) == ([0, 4], 6)
 
 
 @pytest.mark.slow
