@@ -4,13 +4,19 @@ Tests common/addons/router/verb.py."""
 import json
 import tomllib
 from pathlib import Path
+from threading import Event, Thread
 
 import pytest
 import zenoh
 
+from dreamfleet.common.addons.router import verb
+from dreamfleet.common.security.certificate_ledger import RevocationWatcher
+from dreamfleet.common.transport.network import Network
+from dreamfleet.common.transport.session import open_session, zenoh_config
 from tests.support import tasks
 from tests.support.hosts import new_host, require_hosts
-from tests.support.processes import free_port, processes_in
+from tests.support.processes import DEADLINE, free_port, processes_in, until
+from tests.support.relay import Relay
 from tests.support.same_bits import evolve, outcome
 
 ANY = "0.0.0.0:7447"
@@ -106,3 +112,35 @@ def test_a_port_in_use_is_one_line(processes):
     processes.start("router", "--listen", processes.endpoint).wait_for_event("begin")
     code, _, err = processes.call("router", "--listen", processes.endpoint)
     assert (code, str(processes.port) in err, "Traceback" in err) == (1, True, False), err
+
+
+def routers_of(session):
+    return [str(each.zid) for each in session.info.transports() if str(each.whatami) == "router"]
+
+
+@pytest.mark.slow
+def test_a_router_whose_id_another_session_has_begins_again_with_another_id(monkeypatch, tmp_path):
+    monkeypatch.setattr(verb, "LINK_TIMEOUT", 1.0)
+    monkeypatch.setattr(verb, "CHECK_INTERVAL", 0.1)
+    far, near = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
+    stopped = Event()
+    relay = Relay(int(far.rpartition(":")[2]))
+    relay.hold()
+    thread = Thread(
+        target=verb.run_router,
+        args=(Network(listen=(near,), connect=(relay.endpoint,)), stopped, RevocationWatcher(tmp_path, None)),
+    )
+    thread.start()
+    try:
+        with open_session(Network(connect=(near,)), timeout=DEADLINE) as client:
+            (taken,) = map(str, client.info.routers_zid())
+        with open_session(Network(listen=(far,)), timeout=None) as other:
+            double = zenoh_config(Network(connect=(far,)), DEADLINE) | {"id": taken}
+            with zenoh.open(zenoh.Config.from_json5(json.dumps(double))):
+                relay.release()
+                until(lambda: routers_of(other))
+                assert taken not in routers_of(other)
+    finally:
+        stopped.set()
+        thread.join()
+        relay.close()
