@@ -101,7 +101,7 @@ def run_router(network: Network, stopped: Event, revocations: RevocationWatcher)
 def _route(session: zenoh.Session, network: Network, stopped: Event, revocations: RevocationWatcher) -> None:
     """Route until `stopped`, or until another router answers and does not link this one."""
     summary_at = linked_at = monotonic()
-    said: set[str] = set()  # of which addresses nobody answers at
+    said: set[str] = set()  # of which addresses do not answer
     while not stopped.wait(CHECK_INTERVAL):
         now = monotonic()
         revocations.reload_if_changed(now)
@@ -115,7 +115,7 @@ def _route(session: zenoh.Session, network: Network, stopped: Event, revocations
             linked_at = now
             apart, silent = _find_unlinked(session, network)
             for each in silent - said:
-                log.warning("not linked to %s: nobody answers there", each, extra={"facts": {"event": "unlinked"}})
+                log.warning("not linked to %s: it does not answer", each, extra={"facts": {"event": "unlinked"}})
             said |= silent
             if apart:
                 text = "%s answers, but not this router, whose id another session may have: it begins again"
