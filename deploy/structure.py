@@ -208,13 +208,16 @@ def rules_of(module: str, users: set[str]) -> Iterator[str]:
         for container in contract.get("containers", [""]):
             rooms = [[f"{container}.{room}".lstrip(".") for room in layer.split(" | ")] for layer in layers]
             for number, floor in enumerate(rooms):
-                if any(is_in(module, room) for room in floor):
-                    below = [room.removeprefix("dreamfleet.") for layer in rooms[number + 1 :] for room in layer]
-                    yield f"of {container or 'dreamfleet'} it may import its room, and {', '.join(below) or 'no other'}"
+                for own_room in (room for room in floor if is_in(module, room)):
+                    below = [room for layer in rooms[number + 1 :] for room in layer]
+                    text = f"of {container or 'dreamfleet'} it may import {', '.join([own_room, *below])}, and no other"
+                    yield text.replace("dreamfleet.", "")
         own = any(is_in(module, each) for each in sources)
         through = sorted({each for each in users for source in sources if is_in(each, source)})
-        if own or through or module in contract.get("modules", []):
-            forbidden = ", ".join(contract.get("forbidden_modules", []))
+        alike = contract.get("modules", [])
+        if own or through or any(is_in(module, each) for each in alike):
+            others = [each.removeprefix("dreamfleet.") for each in alike if not is_in(module, each)]
+            forbidden = ", ".join([*contract.get("forbidden_modules", []), *others])
             by = "" if own or not through else f", as {through[0].removeprefix('dreamfleet.')} uses it"
             yield f"{contract['name']}{by}{f': not {forbidden}' if forbidden else ''}"
 
@@ -252,12 +255,13 @@ def about(path: Path) -> dict[str, list[str]]:
         listed = "the room lists it for others"
     else:
         listed = "the room's own" + (": no other room imports it" if not outside else ", and imported from elsewhere")
+    kind = "core" if path in core() else "an add-on" if "addons" in path.parts else "neither core nor add-on"
     documents = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/**/*.md"))]
     groups = CONFIG["project"]["entry-points"].items()
     points = [f"{each}: {name}" for each, of in groups for name, value in of.items() if value.startswith(f"{module}:")]
     return {
         str(path): [ast.get_docstring(ast.parse(text)) or ""],
-        str(path.parent): [ast.get_docstring(ast.parse((ROOT / room).read_text())) or "", listed],
+        str(path.parent): [ast.get_docstring(ast.parse((ROOT / room).read_text())) or "", listed, kind],
         "bound by": list(rules_of(module, users_of(module, imported))),
         "imported by": list(map(str, product)),
         "tests": list(map(str, tests)),

@@ -7,6 +7,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 
+from deploy import structure
 from deploy.structure import (
     ROOT,
     SIDES,
@@ -152,6 +153,13 @@ def test_one_class_supervises_child_processes():
 
 def test_each_path_in_a_printed_command_is_quoted():
     assert printed_words() == PLAIN_WORDS, "use shell_command, run_command or shlex: a path may hold spaces"
+
+
+def test_each_contract_is_named_for_a_file_that_it_binds():
+    contracts = structure.CONFIG["tool"]["importlinter"]["contracts"]
+    said = {each for path in sources(*SIDES) for each in structure.rules_of(f"dreamfleet.{module_of(path)}", set())}
+    named = {each["name"] for each in contracts if any(line.startswith(each["name"]) for line in said)}
+    assert named == {each["name"] for each in contracts if each["type"] != "layers"}
 
 
 def test_each_command_about_a_stored_run_names_the_folder_of_runs():

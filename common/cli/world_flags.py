@@ -1,6 +1,6 @@
 """The flags of `collect`, `pipeline` and `iterate` for a data set's world: the task, and what is seen of it.
 
-The task's `parse_options` takes them.
+`parse_options` of each recordable task takes them (`worker/tasks/recordable.py`); `IterateConfig` keeps them.
 """
 
 import argparse

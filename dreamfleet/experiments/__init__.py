@@ -1,3 +1,3 @@
 """Experiments, above both sides: several runs in sequence or side by side, and one run of your program."""
 
-__all__ = ["minimise", "started_run", "controllers", "pipeline"]
+__all__ = ["minimise", "started_run", "controllers", "pipeline", "demo", "rerun"]

@@ -1,7 +1,7 @@
 """The demonstration: a coordinator and one worker per core on this machine, as a person would start them.
 
-Two runs: one in the dream, and one in reality from the dream's best mean. It starts verbs as processes and watches
-over Zenoh; it imports neither the service nor the worker.
+Two runs: one in the dream, and one in reality from the dream's best mean. It starts coordinator and workers as
+processes and watches over Zenoh. It judges and records by the worker's functions.
 """
 
 import math

@@ -10,4 +10,5 @@ __all__ = [
     "checkpoint",
     "assemble",
     "torch_setup",
+    "dream_facts",
 ]
