@@ -257,15 +257,23 @@ def about(path: Path) -> dict[str, list[str]]:
         listed = "the room's own" + (": no other room imports it" if not outside else ", and imported from elsewhere")
     kind = "core" if path in core() else "an add-on" if "addons" in path.parts else "neither core nor add-on"
     documents = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/**/*.md"))]
-    groups = CONFIG["project"]["entry-points"].items()
-    points = [f"{each}: {name}" for each, of in groups for name, value in of.items() if value.startswith(f"{module}:")]
+    through = users_of(module, imported)
+    groups, reached = dict(CONFIG["project"]["entry-points"]), {module, *through}
+    verbs = sorted(name for name, value in groups.pop("dreamfleet.verbs").items() if value.partition(":")[0] in reached)
+    points = [
+        f"{each}: {name}"
+        for each, of in groups.items()
+        for name, value in of.items()
+        if value.partition(":")[0] in reached
+    ]
     return {
         str(path): [ast.get_docstring(ast.parse(text)) or ""],
         str(path.parent): [ast.get_docstring(ast.parse((ROOT / room).read_text())) or "", listed, kind],
-        "bound by": list(rules_of(module, users_of(module, imported))),
+        "bound by": list(rules_of(module, through)),
         "imported by": list(map(str, product)),
         "tests": list(map(str, tests)),
-        "entry points": points,
+        "reached by the entry points": points,
+        "and by the verbs (docs/reference/verbs.md)": [", ".join(verbs) if len(verbs) <= 12 else "most of them"],
         "named in": [
             *(str(each.relative_to(ROOT)) for each in documents if spoken.search(each.read_text())),
             *(str(each) for each in sources("deploy") if re.search(named, (ROOT / each).read_text())),
