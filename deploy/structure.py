@@ -25,6 +25,7 @@ SIDES = ("common", "coordinator", "worker", "dreamfleet/experiments")  # and the
 # Words that a reader has to read twice; `style` in CONTRIBUTING.md says what to write instead.
 RIDDLES = re.compile(r"\b(tell|tells|telling|told|untold|whoever|whomever)\b|\b(?:is|are|was|were|be|been) had\b")
 LONG_FILE = 400
+GENERIC = ("run", "configure", "load", "option")  # functions of many files
 # The worlds that ship: what names each of them, and its rooms, the files and folders in which that may stand.
 WORLDS = {
     re.compile("car.?racing", re.IGNORECASE): (
@@ -196,6 +197,19 @@ def measure() -> dict[str, object]:
     return figures
 
 
+def listed_modules(test: Path) -> set[str]:
+    """The files that a test's docstring lists behind "Tests": with their folders, or of the folder that it mirrors."""
+    docstring = re.match(r'"""(.*?)"""', (ROOT / test).read_text(), re.DOTALL)
+    names = re.findall(r"[\w/]+\.py\b", docstring[1].partition("Tests ")[2]) if docstring else []
+    return {name if "/" in name else mirrored(test.with_name(name)) for name in names}
+
+
+def mirrored(test: Path) -> str:
+    """The path that a file of the tests mirrors: `tests/experiments` stands for `dreamfleet/experiments`."""
+    path = str(test.relative_to("tests"))
+    return f"dreamfleet/{path}" if path.startswith("experiments/") else path
+
+
 def is_in(module: str, package: str) -> bool:
     """Whether a module is this package or lies in it (both dotted)."""
     return f"{module}.".startswith(f"{package}.")
@@ -243,12 +257,13 @@ def about(path: Path) -> dict[str, list[str]]:
     file = str(path) if len(list(ROOT.glob(f"*/**/{path.name}"))) > 1 else path.name
     public = [each.name for each in ast.parse(text).body if isinstance(each, (ast.ClassDef, ast.FunctionDef))]
     named = rf"\b({re.escape(file)}|{re.escape(module)})\b"
-    spoken = re.compile("|".join([named, *(f"`{each}\\b" for each in public if not each.startswith("_"))]))
-    mirrored = Path(f"tests/{path.parent}/test_{path.name}".replace("dreamfleet/", ""))
-    tests = [
-        each for each in sources("tests")
-        if each in (mirrored, *users) or re.search(named, (ROOT / each).read_text())
-    ]  # fmt: skip
+    spoken = re.compile(
+        "|".join([named, *(f"`{each}\\b" for each in public if not each.startswith("_") and each not in GENERIC)])
+    )
+    own_test = Path(f"tests/{path.parent}/test_{path.name}".replace("dreamfleet/", ""))
+    naming = [each for each in sources("tests") if re.search(named, (ROOT / each).read_text())]
+    naming += [each for each in sources("tests") if str(path) in listed_modules(each)]
+    tests = [each for each in sources("tests") if each in (own_test, *users, *naming)]
     product = [each for each in users if each not in tests]
     outside = [each for each in product if each.parent != path.parent]
     if f'"{path.stem}"' in (ROOT / room).read_text():

@@ -5,7 +5,6 @@ import re
 from collections import defaultdict
 from importlib import import_module
 from importlib.metadata import entry_points
-from pathlib import Path
 
 from deploy import structure
 from deploy.structure import (
@@ -17,6 +16,8 @@ from deploy.structure import (
     floors,
     imports_of,
     lines,
+    listed_modules,
+    mirrored,
     module_of,
     names_outside_rooms,
     room_arrows,
@@ -89,19 +90,6 @@ def printed_words() -> dict[str, set[str]]:
                 elif command.search(before) and not quoting.match(word := ast.unparse(part.value)):
                     found[str(path)].add(word)
     return found
-
-
-def listed_modules(test: Path) -> set[str]:
-    """The files that a test's docstring lists behind "Tests": with their folders, or of the folder that it mirrors."""
-    docstring = re.match(r'"""(.*?)"""', (ROOT / test).read_text(), re.DOTALL)
-    names = re.findall(r"[\w/]+\.py\b", docstring[1].partition("Tests ")[2]) if docstring else []
-    return {name if "/" in name else mirrored(test.with_name(name)) for name in names}
-
-
-def mirrored(test: Path) -> str:
-    """The path that a file of the tests mirrors: `tests/experiments` stands for `dreamfleet/experiments`."""
-    path = str(test.relative_to("tests"))
-    return f"dreamfleet/{path}" if path.startswith("experiments/") else path
 
 
 def test_no_room_imports_a_room_above_it():

@@ -1,7 +1,8 @@
 """Write the ONNX graphs of a world model node by node from its weights.
 
 They are written by hand rather than traced, because a row's bits must not depend on the batch: weights are constant
-initializers, and no node gathers, loops or reshapes by a traced batch size.
+initializers, and no node gathers, loops or reshapes by a traced batch size. docs/explanation/determinism.md says which
+hosts share bits. A bundle that exists holds its own graphs.
 """
 
 from collections.abc import Callable
