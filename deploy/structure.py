@@ -261,10 +261,10 @@ def about(path: Path) -> dict[str, list[str]]:
         "|".join([named, *(f"`{each}\\b" for each in public if not each.startswith("_") and each not in GENERIC)])
     )
     own_test = Path(f"tests/{path.parent}/test_{path.name}".replace("dreamfleet/", ""))
-    naming = [each for each in sources("tests") if re.search(named, (ROOT / each).read_text())]
-    naming += [each for each in sources("tests") if str(path) in listed_modules(each)]
-    tests = [each for each in sources("tests") if each in (own_test, *users, *naming)]
-    product = [each for each in users if each not in tests]
+    own = [each for each in sources("tests") if each == own_test or str(path) in listed_modules(each)]
+    naming = {each for each in sources("tests") if re.search(named, (ROOT / each).read_text())}
+    product = [each for each in users if each.parts[0] != "tests"]
+    tests = [*own, *sorted({*users, *naming} - {*own, *product})]  # those of its own first
     outside = [each for each in product if each.parent != path.parent]
     if f'"{path.stem}"' in (ROOT / room).read_text():
         listed = "the room lists it for others"

@@ -1,4 +1,7 @@
-"""What a world model's manifest says of its world, so that nobody needs the world's package to begin a run in it."""
+"""What a world model's manifest says of its world, so that nobody needs the world's package to begin a run in it.
+
+Bundles that exist must stay readable, and score alike: a new field has a default and `metadata=OPTIONAL`.
+"""
 
 from __future__ import annotations
 

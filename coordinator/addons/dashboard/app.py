@@ -1,4 +1,4 @@
-"""The dashboard's routes. All are GET and change nothing."""
+"""The dashboard's routes, which docs/how-to/dashboard.md lists. All are GET and change nothing."""
 
 import asyncio
 from collections.abc import AsyncIterator
