@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 
 from dreamfleet.common.protocol.messages import HelloRequest, Job, JobBatch
+from dreamfleet.coordinator.dispatch.failures import LONGEST_PAUSE
 from dreamfleet.coordinator.dispatch.packing import SentBatch
 from dreamfleet.coordinator.run.run import BY_HAND
 from tests.simulation import books
@@ -26,7 +27,7 @@ from tests.simulation.violation import Violation
 from tests.simulation.witness import Confirmed, Witness
 from tests.simulation.worker import Scored, Token, Welcome, Worker
 
-PATIENCE = 120.0  # virtual seconds after the last fault in which everything must be finished
+PATIENCE = 2 * LONGEST_PAUSE + 60  # virtual seconds: a job that failed often is tried again after such a pause
 OPERATOR = 0.5  # virtual seconds after which somebody resumes a run that failing jobs have paused
 AUDIT = 4  # turns of the coordinator between two looks into the books
 MAX_EVENTS = 200_000  # of one play: more is a loop
