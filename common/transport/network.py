@@ -15,7 +15,7 @@ LOOPBACK = "127.0.0.1"
 SECURED_PREFIX = "tls/"  # prefix of a secured fleet's endpoints
 SECURED_ENDPOINT = "tls/0.0.0.0:7447"  # default of a secured coordinator
 LOOK_INTERVAL = 0.02  # seconds between two looks whether a process of this host listens
-_ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws)/(\[[0-9a-fA-F:]+(?:%[\w.-]+)?\]|[^:/\s%]+):(\d{1,5})")
+_ENDPOINT = re.compile(r"(tcp|tls|udp|quic)/(\[[0-9a-fA-F:]+(?:%[\w.-]+)?\]|[^:/\s%]+):(\d{1,5})")
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,7 @@ sqlite3.register_adapter(Checkpoint, Checkpoint.packed)  # when it is written, n
 
 MAX_EVENTS = 10_000  # R26: unknown senders and failing hosts cause some
 LEAVES = "leaves"  # what the last event of an incarnation is that was not killed
+RECALLED = "recalled"  # of one that left to the next what was taken back
 # Seconds for which a write waits for another program's lock. A run tries again, so that it answers meanwhile.
 SERVING_TIMEOUT, LEAVING_TIMEOUT = 0.5, 5.0
 FINGERPRINT, HOST_CLASS = "fingerprint", "host_class"  # the facts' names
@@ -160,7 +161,11 @@ class Journal(JournalConnection):
         """Number of this incarnation of the coordinator, from 1; to be committed before anything is published."""
         number = int(self.fact("incarnation") or 0) + 1
         last = self.read_row("SELECT what FROM event ORDER BY number DESC LIMIT 1")
-        killed = "; the last one was killed, crashed or could not write" if last not in (None, (LEAVES,)) else ""
+        killed = (
+            "; the last one was killed, crashed or could not write"
+            if last not in (None, (LEAVES,), (RECALLED,))
+            else ""
+        )
         self._incarnation = number
         self.set_fact("incarnation", str(number))
         self.drop_fact(REST)

@@ -39,7 +39,7 @@ EXCHANGE = """if True:
 def test_bad_endpoints_are_refused():
     for endpoint in ("tcp/127.0.0.1:7447", "tls/host.example:1", "tcp/[::1]:7447", "tcp/[fe80::1%lo]:7447"):
         assert check_endpoint(endpoint) == endpoint
-    for endpoint in ("", "127.0.0.1:7447", "tcp/host", "tcp/host:99999", "tcp/ host:1", "ftp/host:21"):
+    for endpoint in ("", "127.0.0.1:7447", "tcp/host", "tcp/host:99999", "tcp/ host:1", "ftp/h:21", "ws/h:1"):
         with pytest.raises(UsageError, match=re.escape(repr(endpoint))):
             Network(listen=(endpoint,))
     with pytest.raises(UsageError, match=r"quic/host\.example:7447.*--join"):

@@ -112,6 +112,8 @@ def test_the_operator_bars_a_host_and_lets_it_in_again_and_a_misspelt_one_change
     assert bench.obey("bar", "b").why
     bench.run.commit()
     bench.restart()
+    (begun,) = bench.journal.read_row("SELECT text FROM event WHERE text LIKE 'incarnation 2%'")
+    assert "killed" not in begun
     assert [*bench.run.admission.barred] == ["a"]
     assert "--no-longer" in bench.run.admission.find_refusal(bench.request(A)).remedy
     summary = bench.run.verification.summary

@@ -17,6 +17,7 @@ from dreamfleet.worker.tasks.api import Actions
 from dreamfleet.worker.worldmodel.inference import Decoder
 
 SIZE = 720, 680  # pixels of a frame
+MOST_ACTIONS = 1 << 31  # a larger whole number is no choice of one
 EDGE, LABEL, BIG, SMALL = 16, 22, 340, 163  # pixels: margin, a line of text, the sides of large and small pictures
 STRIP = EDGE + LABEL + BIG + 10  # top of the row of dreamt pictures
 FOOT = STRIP + LABEL + SMALL + 16  # top of the text
@@ -130,7 +131,8 @@ class LiveCanvas(Board):
         self._draw_score(self._profile.score_label, self._profile.format_amount(frame.reward), (EDGE, FOOT))
         for row, line in enumerate(lines):
             self._text(line, (EDGE, FOOT + 30 + 20 * row), self._small, FAINT)
-        discrete = self._dreamer is None and len(frame.action) == 1 and frame.action[0].is_integer()
+        single = frame.action[0] if self._dreamer is None and len(frame.action) == 1 else 0.5
+        discrete = single.is_integer() and abs(single) < MOST_ACTIONS
         if frame.action:
             action = np.array(frame.action, np.int64 if discrete else np.float64)
             self._draw_action(action, SIZE[0] - EDGE + 16, FOOT)

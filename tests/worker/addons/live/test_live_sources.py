@@ -73,7 +73,7 @@ def test_the_viewer_decodes_a_workers_frame_and_continues_it_as_a_dream(random_b
 @pytest.mark.parametrize(
     "more",
     [{"latent": bytes(8)}, {"latent": b""}, {"state": bytes(8)}, {"parameters": bytes(16)},
-     {"picture": b"", "packed": False}],
+     {"picture": b"", "packed": False}, {"action": (1e300,)}],
 )  # fmt: skip
 def test_a_frame_of_another_world_model_is_shown_without_the_model(random_bundle, more):
     live = live_frame_of(random_bundle, "car-racing", **more)
