@@ -204,8 +204,8 @@ class RunSession:
         if self._link.secured and not self._said_shut_out and list(self._link.session.info.routers_zid()):
             self._said_shut_out = True
             text = (
-                f"a router answers, and shows this worker no coordinator of run {self._admission.run}: it is not served, "
-                f"a router between is away, or {self._link.identity} was revoked and needs another join file"
+                f"a router answers, and shows this worker no coordinator of run {self._admission.run}: it is not "
+                f"served, a router between is away, or {self._link.identity} was revoked and needs another join file"
             )
             log_event(log, "shut out", text, level=logging.WARNING, run=self._admission.run)
 

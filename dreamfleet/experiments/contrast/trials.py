@@ -33,9 +33,10 @@ LOCK = "contrast.lock"
 
 @dataclass(frozen=True)
 class StoredContrast:
-    """The data set that a folder was begun on, and its trials."""
+    """The data set that a folder was begun on, its size then, and its trials."""
 
     data: str
+    drives: int  # encoded ones
     contrast: Contrast
 
 
@@ -55,13 +56,19 @@ class Trials:
         for name in SHARED:
             if not path_exists(self._data / name):
                 raise DatasetError(f"{self._data} has no {name}: collect, train the VAE and encode there first")
-        if not any((self._data / "encoded").iterdir()):
+        drives = sum(1 for _ in (self._data / "encoded").iterdir())
+        if not drives:
             raise DatasetError(f"{self._data} has no encoded drives: {shell_command('encode', '--data', self._data)}")
         path = self._folder / SETTINGS
-        own = StoredContrast(str(self._data.resolve()), self._contrast)
+        own = StoredContrast(str(self._data.resolve()), drives, self._contrast)
         begun = read_document(path, partial(from_plain, StoredContrast)) or own
         if begun.data != own.data:
             raise UsageError(f"{self._folder} was begun on {begun.data}: begin in another --out")
+        if begun.drives != own.drives:
+            raise UsageError(
+                f"{self._folder} was begun when {begun.data} had {begun.drives} encoded drives, and now it has "
+                f"{own.drives}: trials of other data do not compare, so begin in another --out"
+            )
         kept = replace(own, contrast=self._contrast.continue_from(begun.contrast))
         for trial in self._contrast.trials:  # refuses wrong training flags
             self._link_data(trial)

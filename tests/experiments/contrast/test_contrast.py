@@ -2,6 +2,7 @@
 
 import json
 import re
+from unittest.mock import Mock
 
 import pytest
 
@@ -9,7 +10,8 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.schema.validation import from_plain, to_plain
 from dreamfleet.experiments.contrast.config import KINDS, Contrast, Trial
 from dreamfleet.experiments.contrast.summary import TrialResult, describe_difference, differences, means, rows
-from dreamfleet.experiments.contrast.trials import StoredContrast
+from dreamfleet.experiments.contrast.trials import SETTINGS, StoredContrast, Trials
+from dreamfleet.experiments.local.kept_document import write_document
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 
@@ -58,8 +60,19 @@ def test_seeds_and_kinds_may_be_added_but_none_changed():
         Contrast(kinds=(KINDS[0], ("attentive", "--window 4"))).continue_from(kept)
     with pytest.raises(UsageError, match="run_flags"):
         Contrast(run_flags="--generations 3").continue_from(kept)
-    stored = StoredContrast("data", kept)
+    stored = StoredContrast("data", 3, kept)
     assert from_plain(StoredContrast, json.loads(json.dumps(to_plain(stored)))) == stored
+
+
+def test_a_data_set_that_grew_is_another_one(tmp_path):
+    data, folder = tmp_path / "data", tmp_path / "out"
+    for each in (data / "episodes", data / "encoded", folder):
+        each.mkdir(parents=True)
+    for each in ("vae.safetensors", "encoded/1", "encoded/2"):
+        (data / each).touch()
+    write_document(folder / SETTINGS, to_plain(StoredContrast(str(data), 1, Contrast())), "--out")
+    with pytest.raises(UsageError, match=re.escape(str(folder))):
+        Trials(Contrast(), data, folder, Mock(), Mock()).begin()
 
 
 def outcome(kind, seed, nats, score):
