@@ -243,13 +243,13 @@ class Worker:
         self._events.put(("over", served))
 
     def _end_run(self, served: ServedRun) -> None:
-        """Forget a run that is over. An error ends a worker of one run at a time; beside others, the run waits."""
+        """Forget a run that is over. An error ends a worker of one run; with `any` the run waits."""
         served.thread.join()
         self._served.remove(served)
         self._waiting, error = self._waiting_text(served), served.error
         if error is not None and not isinstance(error, DreamfleetError):
             log.error("run %s ended by an error of this worker", served.name, exc_info=error)
-        if isinstance(error, (RefusedError, DownloadError)) or (error is not None and self._config.runs > 1):
+        if isinstance(error, (RefusedError, DownloadError)) or (error is not None and self._config.any):
             self._handle_refusal(served.name, error)
         elif error is not None:
             raise error

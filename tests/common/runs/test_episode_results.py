@@ -399,11 +399,8 @@ def test_a_confirmed_mean_goes_before_the_best_evaluated_one(runs):
     confirm(runs / "reality", generation, 4, 2.5, 0.5, closed)
     found, _ = find_controller("reality", runs)
     assert (found.parameters == vector).all()
-    assert [found.provenance[each] for each in ("generation", "validation_mean", "confirmed")] == [
-        generation,
-        2.5,
-        True,
-    ]
+    named = [found.provenance[each] for each in ("generation", "validation_mean", "confirmed")]
+    assert named == [generation, 2.5, True]
 
 
 def test_another_runs_controller_is_refused(runs):

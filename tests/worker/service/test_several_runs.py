@@ -89,7 +89,8 @@ def test_stopped_twice_it_leaves_every_run_at_once(both):
     assert served.result(DEADLINE) is None
 
 
-def test_a_run_that_cannot_be_scored_ends_no_other(stage, said, cached, monkeypatch):
+@pytest.mark.parametrize("runs", [4, 1])
+def test_a_run_that_cannot_be_scored_ends_no_other(stage, said, cached, monkeypatch, runs):
     """One run's slots cannot start; the worker says why, asks that run later, and serves the other."""
     bad = stage.hand(tasks.SECOND_TOY, run="bad")
     good = stage.also(bad, run="good")
@@ -102,7 +103,7 @@ def test_a_run_that_cannot_be_scored_ends_no_other(stage, said, cached, monkeypa
         real(self, share, arguments, *rest, **more)
 
     monkeypatch.setattr(SlotPool, "__init__", fails)
-    _, served = stage.worker(run=None, any=True, announced=(*tasks.ALL, tasks.SECOND_TOY))
+    _, served = stage.worker(run=None, any=True, runs=runs, announced=(*tasks.ALL, tasks.SECOND_TOY))
     wait_for(said, "no room on this device")
     good.ready()
     good.send(1, good.job())

@@ -26,7 +26,7 @@ from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, World
 from dreamfleet.worker.tasks.closing import close_environment
 
 RGB = "rgb_array"  # gymnasium's render mode that returns pictures
-_MODULE_PREFIX = re.compile(r"([\w.]+):")  # of an environment's name
+_MODULE_PREFIX = re.compile(r"([^\s:]+):")  # of an environment's name
 LONGEST_NAME = 128  # characters of an action's name, as a manifest holds it
 FASTEST = 1000  # pictures a second, as a manifest holds them
 DEFAULT_MAX_STEPS = 10_000  # steps of an episode, if the environment was registered without a limit

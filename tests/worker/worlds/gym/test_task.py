@@ -417,6 +417,7 @@ def test_an_action_is_a_vector_that_the_simulator_gets_as_its_own(kind, outputs,
         ("CartPole-v1", {"observation": "render", "environment": {"wings": 2}}, "wings"),
         ("no_such_module:X-v0", {}, "--trust no_such_module"),
         ("CartPole-v1", {"environment": {"inner": "no_such_module:X-v0"}}, "--trust no_such_module"),
+        ("CartPole-v1", {"environment": {"inner": "no-such:X-v0"}}, "--trust no-such"),
     ],
 )
 def test_an_environment_without_such_pictures_is_refused_with_the_reason(name, options, named):
