@@ -168,7 +168,7 @@ class RemoteHost:
         more = f"; {stay} is there too: `dreamfleet down {shlex.quote(self.host.address)}` ends all" if stay else ""
         if left := [each.name for each in answer.ended if each.running]:
             return HostStatus(self.host.name, "left", f"{', '.join(left)} left{more}")
-        return HostStatus(self.host.name, "nothing", f"no worker of this name runs there{more}")
+        return HostStatus(self.host.name, "nothing", f"no worker{' of this name' if stay else ''} runs there{more}")
 
     def close(self) -> None:
         """Close the connection, which ends a worker that uses its tunnel. From any thread."""
