@@ -249,17 +249,35 @@ def users_of(module: str, imported: dict[Path, set[str]]) -> set[str]:
     return found - {module}
 
 
+def subclasses(names: set[str], users: list[Path]) -> Iterator[str]:
+    """The classes in these files that extend one of these names."""
+    for path in users:
+        for node in ast.walk(ast.parse((ROOT / path).read_text())):
+            for base in {ast.unparse(each).rpartition(".")[2] for each in getattr(node, "bases", [])} & names:
+                yield f"{path}: {node.name}({base})"  # type: ignore[attr-defined]
+
+
 def about(path: Path) -> dict[str, list[str]]:
     """What a change of a file (a path in the repository) may touch: its room, rules, importers, tests and documents."""
+    if path not in sources(*SIDES):
+        raise SystemExit(f"no Python file of {', '.join(SIDES)}: {path}")
     module, text, room = f"dreamfleet.{module_of(path)}", (ROOT / path).read_text(), path.parent / "__init__.py"
     imported = {each: set(imports_of(each)) for each in sources(*SIDES, "tests")}
     users = [each for each, names in imported.items() if any(is_in(f"dreamfleet.{name}", module) for name in names)]
     file = str(path) if len(list(ROOT.glob(f"*/**/{path.name}"))) > 1 else path.name
     public = [each.name for each in ast.parse(text).body if isinstance(each, (ast.ClassDef, ast.FunctionDef))]
     named = rf"\b({re.escape(file)}|{re.escape(module)})\b"
+    groups = dict(CONFIG["project"]["entry-points"])
+    verbs = {name.replace(".", " "): value.partition(":")[0] for name, value in groups.pop("dreamfleet.verbs").items()}
+    own_verbs = [f"dreamfleet {verb}\\b" for verb, of in verbs.items() if of == module]
     spoken = re.compile(
-        "|".join([named, *(f"`{each}\\b" for each in public if not each.startswith("_") and each not in GENERIC)])
+        "|".join(
+            [named, *own_verbs, *(f"`{each}\\b" for each in public if not each.startswith("_") and each not in GENERIC)]
+        )
     )
+    scripts = [
+        each for each in [ROOT / "Makefile", ROOT / ".ci/run", *sorted(ROOT.glob("deploy/**/*"))] if each.is_file()
+    ]
     own_test = Path(f"tests/{path.parent}/test_{path.name}".replace("dreamfleet/", ""))
     own = [each for each in sources("tests") if each == own_test or str(path) in listed_modules(each)]
     naming = {each for each in sources("tests") if re.search(named, (ROOT / each).read_text())}
@@ -273,8 +291,8 @@ def about(path: Path) -> dict[str, list[str]]:
     kind = "core" if path in core() else "an add-on" if "addons" in path.parts else "neither core nor add-on"
     documents = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/**/*.md"))]
     through = users_of(module, imported)
-    groups, reached = dict(CONFIG["project"]["entry-points"]), {module, *through}
-    verbs = sorted(name for name, value in groups.pop("dreamfleet.verbs").items() if value.partition(":")[0] in reached)
+    reached = {module, *through}
+    near = sorted(verb for verb, of in verbs.items() if of in reached)
     points = [
         f"{each}: {name}"
         for each, of in groups.items()
@@ -286,12 +304,17 @@ def about(path: Path) -> dict[str, list[str]]:
         str(path.parent): [ast.get_docstring(ast.parse((ROOT / room).read_text())) or "", listed, kind],
         "bound by": list(rules_of(module, through)),
         "imported by": list(map(str, product)),
+        "extended by": list(subclasses(set(public), users)),
         "tests": list(map(str, tests)),
         "reached by the entry points": points,
-        "and by the verbs (docs/reference/verbs.md)": [", ".join(verbs) if len(verbs) <= 12 else "most of them"],
+        "and by the verbs (docs/reference/verbs.md)": [", ".join(near) if len(near) <= 12 else "most of them"],
         "named in": [
             *(str(each.relative_to(ROOT)) for each in documents if spoken.search(each.read_text())),
-            *(str(each) for each in sources("deploy") if re.search(named, (ROOT / each).read_text())),
+            *(
+                str(each.relative_to(ROOT))
+                for each in scripts
+                if each.suffix not in (".pyc", ".lock") and spoken.search(each.read_text(errors="replace"))
+            ),
         ],
     }
 
