@@ -249,12 +249,28 @@ def users_of(module: str, imported: dict[Path, set[str]]) -> set[str]:
     return found - {module}
 
 
+def names_taken(path: Path, module: str) -> list[str]:
+    """What a file imports from a module (dotted, with `dreamfleet.`)."""
+    tree = ast.walk(ast.parse((ROOT / path).read_text()))
+    found = (node.names for node in tree if isinstance(node, ast.ImportFrom) and node.module == module)
+    return sorted({alias.name for names in found for alias in names})
+
+
 def subclasses(names: set[str], users: list[Path]) -> Iterator[str]:
     """The classes in these files that extend one of these names."""
     for path in users:
         for node in ast.walk(ast.parse((ROOT / path).read_text())):
             for base in {ast.unparse(each).rpartition(".")[2] for each in getattr(node, "bases", [])} & names:
                 yield f"{path}: {node.name}({base})"  # type: ignore[attr-defined]
+
+
+def texts(*patterns: str) -> dict[str, str]:
+    """The files of the repository that match, by path; what is made by another program is left out."""
+    paths = (path for pattern in patterns for path in sorted(ROOT.glob(pattern)))
+    made = (".pyc", ".lock")
+    return {
+        str(each.relative_to(ROOT)): each.read_text() for each in paths if each.is_file() and each.suffix not in made
+    }
 
 
 def about(path: Path) -> dict[str, list[str]]:
@@ -269,18 +285,20 @@ def about(path: Path) -> dict[str, list[str]]:
     named = rf"\b({re.escape(file)}|{re.escape(module)})\b"
     groups = dict(CONFIG["project"]["entry-points"])
     verbs = {name.replace(".", " "): value.partition(":")[0] for name, value in groups.pop("dreamfleet.verbs").items()}
-    own_verbs = [f"dreamfleet {verb}\\b" for verb, of in verbs.items() if of == module]
-    spoken = re.compile(
-        "|".join(
-            [named, *own_verbs, *(f"`{each}\\b" for each in public if not each.startswith("_") and each not in GENERIC)]
-        )
-    )
-    scripts = [
-        each for each in [ROOT / "Makefile", ROOT / ".ci/run", *sorted(ROOT.glob("deploy/**/*"))] if each.is_file()
+    own_verbs = [verb.split() for verb, of in verbs.items() if of == module]
+    between = r"""["', ]+"""
+    calls = [rf"""(\(|dreamfleet["'],?)\s*["']{between.join(verb)}["']""" for verb in own_verbs]
+    written = [f"dreamfleet {' '.join(verb)}\\b" for verb in own_verbs]
+    codes = [f"`{each}\\b" for each in public if not each.startswith("_") and each not in GENERIC]
+    worlds = [
+        f"(?i:{name.pattern})" for name, rooms in WORLDS.items() if any(path.is_relative_to(room) for room in rooms)
     ]
+    pages = re.findall(r"docs/[\w/-]+\.md", text)
+    in_code = re.compile("|".join([named, *calls, *written]))
+    in_pages = re.compile("|".join([named, *written, *codes, *worlds]))
     own_test = Path(f"tests/{path.parent}/test_{path.name}".replace("dreamfleet/", ""))
     own = [each for each in sources("tests") if each == own_test or str(path) in listed_modules(each)]
-    naming = {each for each in sources("tests") if re.search(named, (ROOT / each).read_text())}
+    naming = {each for each in sources("tests") if in_code.search((ROOT / each).read_text())}
     product = [each for each in users if each.parts[0] != "tests"]
     tests = [*own, *sorted({*users, *naming} - {*own, *product})]  # those of its own first
     outside = [each for each in product if each.parent != path.parent]
@@ -289,7 +307,8 @@ def about(path: Path) -> dict[str, list[str]]:
     else:
         listed = "the room's own" + (": no other room imports it" if not outside else ", and imported from elsewhere")
     kind = "core" if path in core() else "an add-on" if "addons" in path.parts else "neither core nor add-on"
-    documents = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/**/*.md"))]
+    documents = texts("README.md", "CONTRIBUTING.md", "docs/**/*.md", ".github/**/*")
+    scripts = texts("Makefile", ".ci/run", "deploy/**/*", "docs/**/*.py")
     through = users_of(module, imported)
     reached = {module, *through}
     near = sorted(verb for verb, of in verbs.items() if of in reached)
@@ -303,18 +322,14 @@ def about(path: Path) -> dict[str, list[str]]:
         str(path): [ast.get_docstring(ast.parse(text)) or ""],
         str(path.parent): [ast.get_docstring(ast.parse((ROOT / room).read_text())) or "", listed, kind],
         "bound by": list(rules_of(module, through)),
-        "imported by": list(map(str, product)),
+        "imported by": [f"{each} ({', '.join(names_taken(each, module)) or 'the module'})" for each in product],
         "extended by": list(subclasses(set(public), users)),
         "tests": list(map(str, tests)),
         "reached by the entry points": points,
         "and by the verbs (docs/reference/verbs.md)": [", ".join(near) if len(near) <= 12 else "most of them"],
         "named in": [
-            *(str(each.relative_to(ROOT)) for each in documents if spoken.search(each.read_text())),
-            *(
-                str(each.relative_to(ROOT))
-                for each in scripts
-                if each.suffix not in (".pyc", ".lock") and spoken.search(each.read_text(errors="replace"))
-            ),
+            *(name for name, page in documents.items() if name in pages or in_pages.search(page)),
+            *(name for name, script in scripts.items() if in_code.search(script)),
         ],
     }
 

@@ -1,4 +1,7 @@
-"""The presets of whole trainings: amounts of data and updates, and the models' layers."""
+"""The presets of whole trainings: amounts of data and updates, and the models' layers.
+
+A row of docs/reference/presets.md each.
+"""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Any, get_type_hints

@@ -278,6 +278,11 @@ def test_help_lists_each_presets_values():
     assert "(default 16; notebook 64)" in " ".join(learning.format_all_help().split())
 
 
+def test_docs_have_a_row_for_each_training_preset():
+    page = (ROOT / "docs" / "reference" / "presets.md").read_text().partition("## Presets of trainings")[2]
+    assert sorted(re.findall(r"^\| `([\w-]+)`", page, re.MULTILINE)) == sorted(NAMES["training"])
+
+
 def test_docs_list_each_run_presets_values():
     page = (ROOT / "docs" / "reference" / "presets.md").read_text()
     described = dict(re.findall(r"^\| `([\w-]+)` \| `(--[^`]+)`", page, re.MULTILINE))
