@@ -351,7 +351,7 @@ class Fleet:
         self.counts["discarded_steps"] += pending.steps_lost_to(identity, result.steps)
         pending.holders -= {identity}
         if self.jobs.is_drawn(pending.work) and not pending.is_control:
-            self.leases.check_again(pending, Check(host_class, {host_of(identity)}))
+            self.leases.check_again(pending, Check(host_class, {self.jobs.voter_of(identity)}))
         else:
             self.leases.cancel(pending)
         self.failure_judge.working_hosts.add(host_of(identity))

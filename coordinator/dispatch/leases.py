@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Iterable
 
 from dreamfleet.coordinator.dispatch.event_log import EventLog
-from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.dispatch.member import DispatchGroup, Lease, Member
 from dreamfleet.coordinator.dispatch.pending_jobs import JobState, PendingJob, PendingJobs
 from dreamfleet.coordinator.dispatch.speculative_execution import Move
@@ -101,7 +100,7 @@ class Leases:
         if pending.work.digest in self._jobs:
             self._jobs.remove(pending.work.digest)
         members = self._members
-        kept = {name for name in pending.holders if check.may_ask(host_of(name), members[name].host_class)}
+        kept = {name for name in pending.holders if check.may_ask(self._jobs.voter_of(name), members[name].host_class)}
         pending.holders -= kept
         self.cancel(pending)
         self._jobs.offer_check(pending.work, check, kept)

@@ -125,6 +125,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         self._accepted: dict[bytes, int] = {}  # digest -> generation, of this generation and the last
         self.checks: dict[bytes, PendingJob] = {}  # wanted jobs whose accepted result another host is to repeat
         self.is_drawn: Callable[[ScoringJob], bool] = lambda _: False  # whether a job's result is to be checked
+        self.voter_of: Callable[[str], str] = host_of  # on whose word a worker's answer to a check stands
 
     def __getitem__(self, digest: bytes) -> PendingJob:
         return self._pending[digest]
@@ -299,7 +300,7 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         pending = self._pending[digest]
         pending.attempts = (*pending.attempts, attempt)[-MAX_FAILED:]
         if pending.check is not None:
-            pending.check.passed_over.add(host_of(attempt.worker))
+            pending.check.passed_over.add(self.voter_of(attempt.worker))
             return
         self._failing[digest] = pending
         pending.order, self._next_order = self._next_order, self._next_order + 1

@@ -8,10 +8,9 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.dispatch.host_stats import HostStats
 from dreamfleet.coordinator.dispatch.member import Lease, Member
-from dreamfleet.coordinator.dispatch.pending_jobs import JobState, PendingJob
+from dreamfleet.coordinator.dispatch.pending_jobs import JobState, PendingJobs
 from dreamfleet.coordinator.dispatch.worker_selection import is_dependable
 from dreamfleet.coordinator.jobs.scoring_job import ScoringJob
 
@@ -38,9 +37,7 @@ class Move:
 class SpeculativeExecution:
     """Plans moves of `jobs` to idle slots of `members`, from the typical length and duration of accepted jobs."""
 
-    def __init__(
-        self, heartbeat_interval: float, jobs: Mapping[bytes, PendingJob], members: Mapping[str, Member]
-    ) -> None:
+    def __init__(self, heartbeat_interval: float, jobs: PendingJobs, members: Mapping[str, Member]) -> None:
         self._heartbeat_interval = heartbeat_interval
         self._jobs = jobs
         self._members = members
@@ -200,7 +197,7 @@ class SpeculativeExecution:
         job = self._jobs.get(digest)
         if job is None or job.is_suspect or job.is_control:
             return False
-        if job.check is not None and not job.check.may_ask(host_of(taker.identity), taker.host_class):
+        if job.check is not None and not job.check.may_ask(self._jobs.voter_of(taker.identity), taker.host_class):
             return False
         return job.state is JobState.LEASED and taker.identity not in job.avoided_workers
 

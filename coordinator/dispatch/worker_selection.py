@@ -202,9 +202,11 @@ class JobAssignment:
 
         R32: both get it in its turn, so its place says nothing.
         """
-        check = Check(self._members[first].host_class, {host_of(first)})
+        check = Check(self._members[first].host_class, {self._jobs.voter_of(first)})
         if not self._jobs[digest].avoided_workers:
-            able = [name for name in self.shares if check.may_ask(host_of(name), self._members[name].host_class)]
+            able = [
+                name for name in self.shares if check.may_ask(self._jobs.voter_of(name), self._members[name].host_class)
+            ]
             self._give_to_least_loaded(self._jobs[digest], able)
 
     def _give_to_least_loaded(self, pending: PendingJob, able: Collection[str]) -> None:
@@ -214,7 +216,7 @@ class JobAssignment:
 
     def _may_check(self, pending: PendingJob, member: Member) -> bool:
         check, load = pending.check, self._load(member.identity) - member.held_share
-        may = check is not None and check.may_ask(host_of(member.identity), member.host_class)
+        may = check is not None and check.may_ask(self._jobs.voter_of(member.identity), member.host_class)
         has_room = member.can_score and member.check_credit > load
         return may and has_room and member.identity not in pending.avoided_workers
 

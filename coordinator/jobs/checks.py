@@ -1,7 +1,8 @@
 """Jobs that several hosts score, and what their answers prove. Pure.
 
 R32: a share of the accepted results is scored again on another host of the same class, and compared to the bit. Where
-two differ, further answers decide who is wrong; one difference alone accuses nobody.
+two differ, further answers decide who is wrong; one difference alone accuses nobody. Each *voter* has one voice: a
+host, or in a secured fleet all that share a join file, for whose names one person may choose.
 """
 
 from __future__ import annotations
@@ -19,15 +20,15 @@ class Check:
     """Which hosts may be given a job again whose result is accepted."""
 
     host_class: str  # of the accepted result
-    answered: set[str] = field(default_factory=set)  # hosts
-    passed_over: set[str] = field(default_factory=set)  # hosts that failed, or took too long
-    only: frozenset[str] | None = None  # hosts that are asked once more; `None`: any other host
+    answered: set[str] = field(default_factory=set)  # voters
+    passed_over: set[str] = field(default_factory=set)  # voters that failed, or took too long
+    only: frozenset[str] | None = None  # voters that are asked once more; `None`: any other
 
-    def may_ask(self, host: str, host_class: str) -> bool:
-        """Whether this host, of this class, may be given the job."""
-        if host_class != self.host_class or host_class in ("", NON_DETERMINISTIC) or host in self.passed_over:
+    def may_ask(self, voter: str, host_class: str) -> bool:
+        """Whether a host of this voter and class may be given the job."""
+        if host_class != self.host_class or host_class in ("", NON_DETERMINISTIC) or voter in self.passed_over:
             return False
-        return host not in self.answered if self.only is None else host in self.only
+        return voter not in self.answered if self.only is None else voter in self.only
 
 
 @dataclass(frozen=True)
@@ -35,16 +36,17 @@ class Answer:
     """What a host gave for a job: fitness, steps and measures, which are compared, and its seconds, which are not."""
 
     host: str
+    voter: str
     fitness: float
     steps: int
     measures: tuple[float, ...] = ()
     seconds: float = 0.0
 
     @classmethod
-    def of(cls, host: str, result: Result) -> Answer:
+    def of(cls, host: str, voter: str, result: Result) -> Answer:
         """From a result with a fitness."""
         assert result.fitness is not None
-        return cls(host, result.fitness, result.steps, tuple(result.measures), result.seconds)
+        return cls(host, voter, result.fitness, result.steps, tuple(result.measures), result.seconds)
 
     @property
     def value(self) -> tuple[float, int, tuple[float, ...]]:
@@ -59,9 +61,9 @@ class Decision:
     All are empty if the answers agree, or if no host can repeat its own.
     """
 
-    wrong: frozenset[str] = frozenset()  # hosts
+    wrong: frozenset[str] = frozenset()  # voters
     ask_other: bool = False
-    ask_again: frozenset[str] = frozenset()  # these hosts
+    ask_again: frozenset[str] = frozenset()  # these voters
     held: frozenset[str] = frozenset()
     by_trusted: bool = False  # whether the word of a trusted host alone says who is wrong
 
@@ -69,32 +71,32 @@ class Decision:
 def decide(answers: Sequence[Answer], present: Collection[str], others: bool, trusted: Collection[str]) -> Decision:
     """What the answers of hosts of one class to one job prove.
 
-    `present` are the hosts that could answer again, `others` says whether one is here that has not answered, and
-    `trusted` are the hosts whose word decides against a single other host.
+    `present` are the voters that could answer again, `others` says whether one is here that has not answered, and
+    `trusted` are those whose word decides against a single other one.
 
-    R32: a value is right if two hosts gave it and fewer gave any other; who ever gave another one is wrong. Without
+    R32: a value is right if two voters gave it and fewer gave any other; who ever gave another one is wrong. Without
     such a value another host answers. Without another host, each answers once more: who contradicts itself is wrong,
     if another does not. Of two that stay with their words, a trusted host is believed. Else both wait for a third host.
     """
     values = defaultdict(set)
     for each in answers:
-        values[each.value].add(each.host)
-    hosts = {each.host for each in answers}
+        values[each.value].add(each.voter)
+    voters = {each.voter for each in answers}
     if len(values) < 2:
         return Decision()
     first, second = sorted(values.items(), key=lambda each: -len(each[1]))[:2]
     if len(first[1]) >= 2 and len(first[1]) > len(second[1]):
-        return Decision(frozenset(each.host for each in answers if each.value != first[0]))
+        return Decision(frozenset(each.voter for each in answers if each.value != first[0]))
     if others:
         return Decision(ask_other=True)
-    if once := {host for host in hosts if sum(each.host == host for each in answers) < 2} & set(present):
+    if once := {one for one in voters if sum(each.voter == one for each in answers) < 2} & set(present):
         return Decision(ask_again=frozenset(once))
-    return _decide_between({host: {each.value for each in answers if each.host == host} for host in hosts}, trusted)
+    return _decide_between({one: {each.value for each in answers if each.voter == one} for one in voters}, trusted)
 
 
 def _decide_between(values: dict[str, set[tuple[float, int, tuple[float, ...]]]], trusted: Collection[str]) -> Decision:
-    """The decision where nobody else can be asked, from each host's own values."""
-    steady = frozenset(host for host, own in values.items() if len(own) == 1)
+    """The decision where nobody else can be asked, from each voter's own values."""
+    steady = frozenset(one for one, own in values.items() if len(own) == 1)
     unsteady = frozenset(values) - steady
     if len(steady) < 2:
         return Decision(unsteady) if steady else Decision()

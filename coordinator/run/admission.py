@@ -1,9 +1,12 @@
 """Which hosts may add to a run: those that know its task and, if the run is strict, compute like its first host."""
 
+from collections.abc import Collection
+
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.protocol.host_classes import effective_class
 from dreamfleet.common.protocol.messages import HelloRequest
 from dreamfleet.common.runs.records import RunSettings
+from dreamfleet.common.security.credentials import worker_seat_identity
 from dreamfleet.common.security.host_key import is_token_of
 from dreamfleet.coordinator.dispatch.event_log import Note
 from dreamfleet.coordinator.dispatch.failures import host_of
@@ -13,15 +16,17 @@ from dreamfleet.coordinator.dispatch.refusals import Refusal, RefusedWorkers, cl
 from dreamfleet.coordinator.storage.journal import FINGERPRINT, HOST_CLASS, Journal
 from dreamfleet.coordinator.storage.verification_records import StoredBar
 
-BARRED_REMEDY = "test its memory and its installation; then start its worker with another --name"
+BARRED_REMEDY = "test its memory and its installation; then start its worker with another --name, or --join file"
 
 
 class WorkerAdmission:
     """Admits workers to a run's fleet and removes those of a foreign class; only a `strict` run has foreign classes."""
 
     def __init__(
-        self, journal: Journal, settings: RunSettings, fleet: Fleet, *, strict: bool, host_key: bytes = b""
-    ) -> None:
+        self, journal: Journal, settings: RunSettings, fleet: Fleet, *, strict: bool, host_key: bytes = b"",
+        is_secured: bool = False,
+    ) -> None:  # fmt: skip
+        """Of a secured fleet (`is_secured`), all hosts that share a join file are one voter (R32)."""
         self.strict = strict
         self.refused_workers = RefusedWorkers()
         # Of the first accepted result; `None` before it.
@@ -31,13 +36,16 @@ class WorkerAdmission:
         self._settings = settings
         self._fleet = fleet
         self._host_key = host_key
+        self._voter_of = fleet.jobs.voter_of = worker_seat_identity if is_secured else host_of
+        self._list_barred_voters()
 
     def find_refusal(self, request: HelloRequest) -> Refusal | None:
         """Why a worker cannot join; `None` if it may."""
         settings = self._settings
         admitted = self.host_class if self.strict else None
         found = find_refusal(request, settings.task.task, admitted, settings.packages)
-        if (bar := self.barred.get(host := host_of(request.worker))) is not None:
+        if (bar := self._bar_of(request.worker)) is not None:
+            host = host_of(request.worker)
             again = shell_command("bar", host, self._journal.path.parent.name, "--no-longer")
             operator = f"ask the run's operator, who can let it in again with `{again}`"
             remedy = operator if bar.by_operator else BARRED_REMEDY
@@ -74,7 +82,7 @@ class WorkerAdmission:
 
         Anybody can send messages in a worker's name: a fingerprint other than that of the worker's hello is not its.
         """
-        if host_of(worker) in self.barred:
+        if self._bar_of(worker) is not None:
             return "result of a barred host"
         member = self._fleet.members.get(worker)
         if member is not None and member.fingerprint != fingerprint:
@@ -100,6 +108,7 @@ class WorkerAdmission:
         """Keep a host out of this run from now on, by the journal too; its workers are removed. The hosts: this one."""
         self._journal.verification.bar(host, bar, incarnation)
         self.barred[host], why = bar, bar.why
+        self._list_barred_voters()
         for worker in [each for each in self._fleet.members if host_of(each) == host]:
             self._fleet.remove_worker(worker)
         self.refused_workers.add(host, f"it is barred from this run: {why}")
@@ -110,7 +119,25 @@ class WorkerAdmission:
         """Let a host join this run again, by the journal too."""
         self._journal.verification.unbar(host)
         del self.barred[host]
+        self._list_barred_voters()
         self.refused_workers.remove(host)
+
+    def hosts_of(self, voters: Collection[str]) -> list[str]:
+        """The hosts of these voters that scored in this run or are here, sorted."""
+        return sorted(host for host in self.known_hosts() if self._voter_of(host) in voters)
+
+    def known_hosts(self) -> set[str]:
+        """The hosts that scored in this run, or are or were here."""
+        scored = self._journal.results.workers(recalled=True)
+        return {*map(host_of, (*scored, *self._fleet.members, *self._fleet.departed))}
+
+    def _bar_of(self, worker: str) -> StoredBar | None:
+        """The bar of a worker's host, or that a check found its voter wrong under another name."""
+        return self.barred.get(host_of(worker)) or self._barred_voters.get(self._voter_of(worker))
+
+    def _list_barred_voters(self) -> None:
+        by_checks = {host: bar for host, bar in self.barred.items() if not bar.by_operator}
+        self._barred_voters = {self._voter_of(host): bar for host, bar in by_checks.items()}
 
     def _accepts_class(self, host_class: str) -> bool:
         return not self.strict or self.host_class in (None, host_class)

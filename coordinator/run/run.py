@@ -48,7 +48,7 @@ class Run:
 
     def __init__(
         self, journal: Journal, settings: RunSettings, limits: LimitsConfig, network: NetworkConfig, now: float,
-        host_key: bytes = b"",
+        host_key: bytes = b"", *, is_secured: bool = False,
     ) -> None:  # fmt: skip
         """`host_key` is the key of this host, by which workers on it show that they are (R32)."""
         self.journal = journal  # whose only writer is the thread of this run
@@ -64,7 +64,9 @@ class Run:
         self.incarnation = journal.begin_incarnation()
         journal.commit()
         self._notes: list[Note] = []  # that are in the journal and not in the log
-        self.admission = WorkerAdmission(journal, settings, self.fleet, strict=network.strict, host_key=host_key)
+        self.admission = WorkerAdmission(
+            journal, settings, self.fleet, strict=network.strict, host_key=host_key, is_secured=is_secured
+        )
         self.verification = Verification(journal, self.fleet, self.admission, network.verify, self.incarnation)
         reached = stored_reason(journal, limits)
         self.state: RunState = Running() if reached is None else Running().reach_limit(reached)
@@ -254,8 +256,7 @@ class Run:
         """
         if self.state.is_rewound or self.state.stalled or not self._take_lock():
             return f"the run cannot be changed now: {self.obstacle}; ask again"
-        scored = self.journal.results.workers(recalled=True)
-        known = {*map(host_of, (*scored, *self.fleet.members, *self.fleet.departed))}
+        known = self.admission.known_hosts()
         if problem := find_bar_problem(host, self.admission.barred, known, is_barred=is_barred):
             return problem
         if is_barred:

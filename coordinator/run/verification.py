@@ -55,7 +55,7 @@ class Verification:
         self._incarnation = incarnation
         self._answers: dict[bytes, list[Answer]] = {}  # to each open check, the accepted result's first
         self._workers: dict[bytes, str] = {}  # whose result was accepted
-        self._held: dict[bytes, frozenset[str]] = {}  # checks that only a further host can decide, with their hosts
+        self._held: dict[bytes, frozenset[str]] = {}  # checks that only a further voter can decide, with theirs
         self._due_since: dict[bytes, float] = {}
         self._findings: dict[bytes, _Finding] = {}  # checks that found hosts wrong, before these are barred
         if share:
@@ -102,7 +102,7 @@ class Verification:
     def note_accepted(self, job: Job, result: Result, worker: str) -> None:
         """Note the accepted result of a job; of a drawn one, to compare it."""
         if job.digest in self._jobs.checks:
-            self._answers[job.digest] = [Answer.of(host_of(worker), result)]
+            self._answers[job.digest] = [self._answer(worker, result)]
             self._workers[job.digest] = worker
 
     def restore(self, work: Iterable[ScoringJob]) -> None:
@@ -111,8 +111,10 @@ class Verification:
             return
         drawn = {each.digest: each for each in work if each.digest not in self._jobs and self.is_drawn(each)}
         for digest, known in self._journal.verification.unverified([each.job for each in drawn.values()]).items():
-            self._jobs.offer_check(drawn[digest], Check(known.host_class, {known.answer.host}))
-            self._answers[digest], self._workers[digest] = [known.answer], known.worker
+            voter = self._jobs.voter_of(known.worker)
+            self._jobs.offer_check(drawn[digest], Check(known.host_class, {voter}))
+            self._answers[digest] = [Answer(host_of(known.worker), voter, *known.value, known.seconds)]
+            self._workers[digest] = known.worker
 
     def keep_to(self, counted: Iterable[ScoringJob]) -> None:
         """Check no candidate's result but those of these jobs: others count no more."""
@@ -122,10 +124,13 @@ class Verification:
 
     def record(self, work: ScoringJob, result: Result, worker: str) -> None:
         """Compare a result of a job whose result was accepted before; a repeated message changes nothing."""
-        answers, answer = self._answers[work.digest], Answer.of(host_of(worker), result)
+        answers, answer = self._answers[work.digest], self._answer(worker, result)
         if answer not in answers and work.digest not in self._findings:
             answers.append(answer)
             self._decide(self._jobs.checks[work.digest])
+
+    def _answer(self, worker: str, result: Result) -> Answer:
+        return Answer.of(host_of(worker), self._jobs.voter_of(worker), result)
 
     def settle(self, now: float) -> None:
         """Let checks wait no longer for hosts that are not here, or that do not answer."""
@@ -136,7 +141,7 @@ class Verification:
             return
         self._forget(*(self._answers.keys() - self._jobs.checks.keys()))  # jobs that were withdrawn
         for worker in self._fleet.members.values():
-            worker.is_held = any(host_of(worker.identity) in hosts for hosts in self._held.values())
+            worker.is_held = any(self._jobs.voter_of(worker.identity) in held for held in self._held.values())
         is_scoring = any(each.work.kind == "score" and each.check is None for each in self._jobs.values())
         for digest, pending in list(self._jobs.checks.items()):
             job = pending.work.job
@@ -156,12 +161,12 @@ class Verification:
             self._answers[digest] = [first]
             del self._held[digest]
             self._due_since.pop(digest, None)
-            self._fleet.leases.check_again(pending, Check(pending.check.host_class, {first.host}))
+            self._fleet.leases.check_again(pending, Check(pending.check.host_class, {first.voter}))
 
     def _can_be_asked(self, pending: PendingJob) -> bool:
         check = pending.check
         return check is not None and any(
-            check.may_ask(host_of(each.identity), each.host_class) for each in self._scoring_members()
+            check.may_ask(self._jobs.voter_of(each.identity), each.host_class) for each in self._scoring_members()
         )
 
     def _scoring_members(self) -> list[Member]:
@@ -171,7 +176,7 @@ class Verification:
         """Ask those who have the job no more: they took too long."""
         assert pending.check is not None
         digest = pending.work.digest
-        check, late = pending.check, {host_of(name) for name in pending.holders}
+        check, late = pending.check, set(map(self._jobs.voter_of, pending.holders))
         self._due_since[digest] = now
         if digest in self._held and late:
             self._fleet.leases.check_again(pending, Check(check.host_class, check.answered, check.passed_over | late))
@@ -185,9 +190,9 @@ class Verification:
         assert check is not None
         answers = self._answers[digest]
         able = [each for each in self._scoring_members() if each.host_class == check.host_class]
-        present = {host_of(each.identity) for each in able} - check.passed_over
-        answered = {each.host for each in answers}
-        trusted = {host_of(each.identity) for each in self._fleet.members.values() if each.is_trusted}
+        present = {self._jobs.voter_of(each.identity) for each in able} - check.passed_over
+        answered = {each.voter for each in answers}
+        trusted = {self._jobs.voter_of(name) for name, each in self._fleet.members.items() if each.is_trusted}
         decision = decide(answers, present, bool(present - answered), trusted)
         if decision.ask_other or decision.ask_again:
             only = decision.ask_again or None
@@ -199,13 +204,13 @@ class Verification:
         else:
             self._finish(pending, decision)
 
-    def _hold(self, pending: PendingJob, hosts: set[str]) -> None:
-        """Neither is believed until a further host answers; that one is asked as soon as it comes."""
+    def _hold(self, pending: PendingJob, voters: set[str]) -> None:
+        """Neither is believed until a further one answers; that one is asked as soon as it comes."""
         digest, check = pending.work.digest, pending.check
         assert check is not None
-        if self._held.get(digest, frozenset()) != frozenset(hosts):
-            self._held[digest] = frozenset(hosts)
-            self._fleet.leases.check_again(pending, Check(check.host_class, set(hosts)))
+        if self._held.get(digest, frozenset()) != frozenset(voters):
+            self._held[digest] = frozenset(voters)
+            self._fleet.leases.check_again(pending, Check(check.host_class, set(voters)))
             self._fleet.note(self.waiting, "differing")
 
     def _finish(self, pending: PendingJob, decision: Decision) -> None:
@@ -241,7 +246,7 @@ class Verification:
         hosts: set[str] = set()
         for found in self._findings.values():
             self._write(found)
-            for host in sorted(found.decision.wrong):
+            for host in self._admission.hosts_of(found.decision.wrong):
                 by_trusted = found.decision.by_trusted
                 witness = "the coordinator's own host" if by_trusted else "another host"
                 why = f"{found.what}; {witness} confirms that {printable(host)} is wrong"

@@ -165,7 +165,10 @@ def _serve_incarnation(request: RunRequest, stop: Stop, kept: _Kept) -> Run:
             if log_to:
                 stack.enter_context(add_on("live-log")(folder, log_to))
             host_key = make_host_key() if request.network.verify else b""
-            run = Run(journal, settings, request.limits, request.network, monotonic(), host_key)
+            run = Run(
+                journal, settings, request.limits, request.network, monotonic(), host_key,
+                is_secured=request.credentials is not None,
+            )  # fmt: skip
             return OpenRun(run, file_watch, served)
 
         word = score_word(settings.task.task) if bundle is None else bundle.manifest.world.score_word

@@ -10,7 +10,6 @@ from typing import Any, Literal
 
 from dreamfleet.common.protocol.messages import Job
 from dreamfleet.common.protocol.result_bounds import to_finite
-from dreamfleet.coordinator.jobs.checks import Answer
 from dreamfleet.coordinator.storage.journal_connection import JournalConnection
 from dreamfleet.coordinator.storage.result_records import ResultRecords
 
@@ -25,7 +24,8 @@ class StoredAnswer:
 
     worker: str
     host_class: str
-    answer: Answer
+    value: tuple[float, int, tuple[float, ...]]  # as of an `Answer`
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -81,9 +81,8 @@ class VerificationRecords:
         found: dict[bytes, StoredAnswer] = {}
         for digest, worker, host_class, fitness, steps, measures, seconds in rows:
             if digest in wanted:
-                measured = tuple(json.loads(measures or "[]"))
-                answer = Answer(worker.partition("/")[0], to_finite(fitness), steps, measured, seconds)
-                found[digest] = StoredAnswer(worker, host_class, answer)
+                value = to_finite(fitness), steps, tuple(json.loads(measures or "[]"))
+                found[digest] = StoredAnswer(worker, host_class, value, seconds)
         return found
 
     def barred(self) -> dict[str, StoredBar]:

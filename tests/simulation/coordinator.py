@@ -52,11 +52,14 @@ def simulated_surroundings(disk_of: Any) -> Iterator[None]:
 class Coordinator:
     """A life that begins from what the disk holds."""
 
-    def __init__(self, disk: Disk, witness: Witness, shape: Shape, life: int, now: float) -> None:
+    def __init__(
+        self, disk: Disk, witness: Witness, shape: Shape, life: int, now: float, *, is_secured: bool = False
+    ) -> None:
         self.nonce = f"{life:016x}"
         limits = LimitsConfig(generations=shape.generations if shape.ends else 0)
         network = NetworkConfig(beat=BEAT, verify=shape.verify, failure_limit=1.0)
-        self.run = Run(SimulatedJournal(disk, witness), settings_of(shape), limits, network, now, HOST_KEY)
+        journal = SimulatedJournal(disk, witness)
+        self.run = Run(journal, settings_of(shape), limits, network, now, HOST_KEY, is_secured=is_secured)
         self.fleet = self.run.fleet
         self.worker_protocol = WorkerProtocol(self.run, "simulated", self.nonce, Intervals(BEAT, REPEAT))
         self.draining = False

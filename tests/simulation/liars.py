@@ -100,12 +100,14 @@ class Found:
 def play_with(
     schedule: Schedule, lies: dict[int, Lie], trusted: frozenset[int] = frozenset(),
     classes: dict[int, str] | None = None, bars: dict[int, float] | None = None,
+    seats: dict[int, int] | None = None,
 ) -> Found:  # fmt: skip
     """Play a schedule with liars; `Violation` if a rule is broken that holds with liars too.
 
-    The operator bars the hosts of `bars`, each at its moment.
+    The operator bars the hosts of `bars`, each at its moment. With `seats`, the fleet is secured.
     """
-    world = World(schedule, patience=5000.0, lies=lies, trusted=trusted, classes=classes or {}, bars=bars or {})
+    given = {"classes": classes or {}, "bars": bars or {}, "seats": seats or {}}
+    world = World(schedule, patience=5000.0, lies=lies, trusted=trusted, **given)  # type: ignore[arg-type]
     world.witness = LenientWitness(schedule.shape)
     _playing[:] = [world]
     honest = True
@@ -122,7 +124,7 @@ def play_with(
         brought[host] += 1
         forged[host] += fitness != fitness_of_job(disk.jobs[digest])
     return Found(
-        frozenset(f"w{host}" for host in lies), frozenset(disk.barred), brought, forged, brought.total(),
+        frozenset(map(world.name_of, lies)), frozenset(disk.barred), brought, forged, brought.total(),
         world.count_checks(), world.counted_jobs, world.scored.steps / 100, honest,
     )  # fmt: skip
 

@@ -72,6 +72,23 @@ def test_whoever_it_is_a_third_host_decides_and_the_run_goes_back_to_where_it_ca
     assert_barred(schedule, lies, trusted)
 
 
+ALIKE = dict.fromkeys((1, 2, 3), by_chance(0.3, 1))  # one person's hosts, which confirm each other
+SEATS = {0: 1, 1: 2, 2: 2, 3: 2, 4: 3}
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("share", [0.5, 1.0])
+@pytest.mark.parametrize("race", [{}, RACE])
+def test_hosts_that_share_a_join_file_have_one_voice_however_many_they_are(seed, share, race):
+    found = play_with(fleet(5, share, run_seed=seed, generations=6, **race), ALIKE, seats=SEATS)
+    assert found.barred == found.liars, "with the first, all names of its join file go"
+    assert found.is_honest
+
+
+def test_in_an_open_fleet_the_most_hosts_decide_also_if_they_lie_alike():
+    assert any(not play_with(fleet(5, run_seed=seed), ALIKE).is_honest for seed in range(4))
+
+
 def test_memory_that_fails_once_is_found_between_two_hosts_without_a_trusted_host():
     assert_barred(fleet(2), {1: one_flip(3)})
 

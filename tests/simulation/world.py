@@ -69,6 +69,7 @@ class World:
     patience: float = PATIENCE
     lies: dict[int, Callable[[Job, float], float]] = field(default_factory=dict)  # by host
     classes: dict[int, str] = field(default_factory=dict)  # by host
+    seats: dict[int, int] = field(default_factory=dict)  # by host: whose join file it has, in a secured fleet
     trusted: frozenset[int] = frozenset()  # hosts that are the coordinator's own
     bars: dict[int, float] = field(default_factory=dict)  # when the operator bars a host
 
@@ -127,7 +128,9 @@ class World:
         if self.coordinator is not None or self._done:
             return
         self.disk.crash()
-        life = self.coordinator = Coordinator(self.disk, self.witness, self.shape, next(self._lives), self.now)
+        life = self.coordinator = Coordinator(
+            self.disk, self.witness, self.shape, next(self._lives), self.now, is_secured=bool(self.seats)
+        )
         self.coordinator_stopped = False
         self._operator_called = False
         self._sendings = books.Sendings()
@@ -224,7 +227,7 @@ class World:
 
     def bar(self, host: int, is_barred: bool = True) -> None:
         """Somebody says `dreamfleet bar HOST`, or adds `--no-longer`, again until it is done."""
-        name = f"w{host}"
+        name = self.name_of(host)
         if self.coordinator is not None and not self.coordinator_stopped:
             self.coordinator.run.bar(name, is_barred=is_barred)
             self.wake_coordinator(LINGER)
@@ -250,7 +253,7 @@ class World:
         """A process, under the name of the one before it."""
         if self.workers[host] is not None:
             return
-        identity = f"w{host}/{next(self._names):08x}"
+        identity = f"{self.name_of(host)}/{next(self._names):08x}"
 
         def send(message: Any) -> None:
             self._send_up(host, identity, message)
@@ -320,6 +323,10 @@ class World:
 
     # Between them.
 
+    def name_of(self, host: int) -> str:
+        """The name of a host; in a secured fleet it ends in its seat."""
+        return f"w{host}.{self.seats[host]}" if self.seats else f"w{host}"
+
     def send_to_coordinator(self, identity: str, message: Any) -> None:
         """A message has arrived at whichever life is there."""
         if self.coordinator is not None:
@@ -347,7 +354,7 @@ class World:
         self.wake_coordinator(LINGER)
 
     def _send_down(self, life: Coordinator, send: SentBatch) -> None:
-        host = int(send.identity.partition("/")[0][1:])
+        host = int(send.identity.partition("/")[0].partition(".")[0][1:])
         batch = life.batch(send)
         self.witness.promised(self.disk, batch)
         link = self.links[host]

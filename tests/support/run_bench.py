@@ -40,6 +40,7 @@ class Bench:
     """A run in a folder; a test delivers its messages and moves its clock."""
 
     strict = False
+    is_secured = False
     failure_limit = 0.5
     host_class = class_from_fingerprint("f")  # of both workers
     workers = (A, B)
@@ -54,7 +55,7 @@ class Bench:
     def begin(self):
         self.given = []  # jobs that were fetched and not finished
         network = NetworkConfig(beat=1.0, strict=self.strict, failure_limit=self.failure_limit)
-        self.run = Run(self.journal, self.settings, self.limits, network, self.now)
+        self.run = Run(self.journal, self.settings, self.limits, network, self.now, is_secured=self.is_secured)
         self.worker_protocol = WorkerProtocol(self.run, "night", "n", Intervals(1.0, 1.0))
         self.run.advance(self.now)
         self.run.commit()

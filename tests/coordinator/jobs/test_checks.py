@@ -54,14 +54,14 @@ STEADY = "x1 y2 x1 y2"
 )
 def test_what_the_answers_of_hosts_prove(given, more, decision):
     """Each answer is a host and its fitness; by default x, y and z could answer again, and nobody else is here."""
-    answers = [Answer(host, float(value), 10, (), float(n)) for n, (host, value) in enumerate(given.split())]
+    answers = [Answer(host, host, float(value), 10, (), float(n)) for n, (host, value) in enumerate(given.split())]
     found = {"present": "xyz", "others": False, "trusted": ()} | more
     assert decide(answers, set(found["present"]), found["others"], found["trusted"]) == decision
 
 
 def test_steps_and_measures_must_be_equal_too():
-    for other in (Answer("y", 1.0, 11, (2.0,)), Answer("y", 1.0, 10, (3.0,))):
-        assert decide([Answer("x", 1.0, 10, (2.0,)), other], {"x", "y"}, True, ()) == OTHER
+    for other in (Answer("y", "y", 1.0, 11, (2.0,)), Answer("y", "y", 1.0, 10, (3.0,))):
+        assert decide([Answer("x", "x", 1.0, 10, (2.0,)), other], {"x", "y"}, True, ()) == OTHER
 
 
 def test_a_check_goes_to_another_host_of_the_class():

@@ -7,6 +7,7 @@ import pytest
 
 from dreamfleet.common.protocol.host_classes import class_from_fingerprint
 from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.coordinator.storage.verification_records import StoredBar
 from tests.support.dispatched import result
 from tests.support.failures import failure
 from tests.support.run_bench import SETTINGS, A, B, Bench
@@ -148,3 +149,23 @@ def test_a_run_that_is_not_strict_accepts_all_classes_and_records_each_results_c
     assert bench.run.journal.results.classes.mixed
     with RunFolder(bench.path) as folder:
         assert folder.classes == bench.run.journal.results.classes
+
+
+class Secured(Bench):
+    """Of a fleet whose workers' names end in their seats."""
+
+    workers = ("gpu.1/1", "gpu.2/1")
+    is_secured = True
+
+
+def test_a_bar_by_a_check_holds_for_all_names_of_a_join_file_and_one_by_the_operator_for_the_host(tmp_path):
+    bench = Secured(tmp_path / "run", None, PLAIN)
+    admission = bench.run.admission
+    admission.bar("gpu.1", StoredBar("found"), 1)
+    assert admission.find_refusal(bench.request("other.1/2")) is not None
+    assert admission.find_refusal(bench.request("gpu.2/2")) is None
+    admission.unbar("gpu.1")
+    assert admission.find_refusal(bench.request("other.1/2")) is None
+    admission.bar("gpu.1", StoredBar("known", by_operator=True), 1)
+    assert admission.find_refusal(bench.request("other.1/2")) is None
+    assert admission.find_refusal(bench.request("gpu.1/2")) is not None
