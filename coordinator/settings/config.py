@@ -37,6 +37,7 @@ from dreamfleet.common.schema.validation import Count
 
 DEFAULT_BUNDLE, NO_BUNDLE, NO_SUBSPACE = "tiny", "none", "none"
 DEFAULT_HORIZON = 1000  # steps
+DEFAULT_UNITS = 8  # of a hidden controller's layer
 LARGEST_STEP = 1e6  # of sigma0: parameters travel in single precision
 Interval = Annotated[int, Meta(ge=0, le=10**6)]  # generations; 0: never
 
@@ -78,8 +79,12 @@ class RunConfig:
         "actions=linear or discrete, pedals=half or one, pedal_shift=, in its dream too, time_cost=, offroad_cost= "
         "(docs/reference/tasks.md)",
     )
-    controller: Literal["linear", "hidden"] = option("linear", "a linear map, or one with a layer of tanh units")
-    hidden_units: Annotated[int, Meta(ge=1, le=10**5)] = option(8, "units of a hidden controller's layer")
+    controller: Literal["linear", "hidden"] | None = option(
+        None, "a linear map, or with a layer of tanh units (default hidden with --hidden-units, else linear)"
+    )
+    hidden_units: Annotated[int, Meta(ge=1, le=10**5)] | None = option(
+        None, f"units of a hidden controller's layer (default {DEFAULT_UNITS})"
+    )
     features: Literal["zh", "z"] = frozen_option(
         RunSettings, "zh", "what the controller sees: latent and hidden state, or latent alone"
     )
@@ -182,6 +187,8 @@ class RunConfig:
             check_task(self.task)
         elif self.bundle == NO_BUNDLE:
             raise UsageError(f"--bundle {NO_BUNDLE}: name what candidates are scored in with --task")
+        if self.controller == "linear" and self.hidden_units is not None:
+            raise UsageError("--hidden-units is of --controller hidden, not linear: omit one of the two")
         if self.racing and self.episodes < 2:
             raise UsageError("--racing needs at least 2 episodes, as one has no second half")
         if not 0 < self.sigma0 <= LARGEST_STEP:
@@ -228,6 +235,11 @@ class RunConfig:
                 "--racing compares all candidates by the first half of their episodes, and of a mixture that would be "
                 "the driven ones: omit it, or pass --driven 0 or 1"
             )
+
+    @property
+    def units(self) -> int:
+        """Units of the controller's layer; 0: it is linear."""
+        return self.hidden_units or (DEFAULT_UNITS if self.controller == "hidden" else 0)
 
     @property
     def needs_no_bundle(self) -> bool:
@@ -284,7 +296,7 @@ def config_values(run: RunSettings, bundle: Path) -> dict[str, Any]:
     """The settings of a run as they would be configured; `bundle` is the path of its copy of the world model."""
     spec, hidden = run.task, run.controller.hidden
     values = frozen_values(RunSettings, run) | frozen_values(TaskSpec, spec)
-    values |= {"controller": "hidden", "hidden_units": hidden} if hidden else {"controller": "linear"}
+    values |= {"controller": "hidden" if hidden else "linear", "hidden_units": hidden or None}
     if not spec.bundle:
         return {**values, "bundle": NO_BUNDLE, "task_options": spec.options}
     return {**values, "bundle": str(bundle), "variant": Variant.from_json(spec.options).option_texts}

@@ -83,10 +83,6 @@ def _confirm_episodes(config: RunConfig) -> int:
     return max(config.evaluation_episodes, 2) if config.confirm_episodes is None else config.confirm_episodes
 
 
-def _hidden(config: RunConfig) -> int:
-    return config.hidden_units if config.controller == "hidden" else 0
-
-
 def _spec(config: RunConfig, bundle: str, shape: ControllerShape | None, options: str, version: int) -> TaskSpec:
     values = frozen_values(TaskSpec, config)
     return TaskSpec(**values, bundle=bundle, controller=shape, options=options, version=version)
@@ -101,9 +97,7 @@ def _with_bundle(config: RunConfig, bundle: Bundle) -> Scored:
     if config.recorded:
         bundle.check_recorded()
     driving, facts = _driving(config, bundle), bundle.manifest.world
-    shape = bundle.with_controllers(
-        bundle.shape_of(config.features, _hidden(config), driving), driving
-    ).controller_shape
+    shape = bundle.with_controllers(bundle.shape_of(config.features, config.units, driving), driving).controller_shape
     own_shape = None if shape == bundle.default_shape else shape
     end = config.end and EndRule.parse(config.end).text
     end = "" if end == facts.end.text else end  # so that it scores as a run that names none
@@ -155,9 +149,11 @@ def _without_bundle(config: RunConfig) -> Scored:
         raise UsageError(f"{named}: only tasks with a world model take this; omit it for {task}")
     description = config.description or describe_task(task, config.description_options())
     options = description.options if config.task_options is None else config.task_options
-    if _hidden(config) and not description.observations:
-        raise UsageError(f"{task} observes nothing, so there is no controller: leave --controller out")
-    shape = ControllerShape(description.observations, description.outputs, _hidden(config))
+    if config.units and not description.observations:
+        raise UsageError(
+            f"{task} observes nothing, so there is no controller: leave --controller and --hidden-units out"
+        )
+    shape = ControllerShape(description.observations, description.outputs, config.units)
     if len(options) > MAX_OPTIONS:
         raise UsageError(
             f"the options of {task} to freeze with the run have {len(options)} characters, {MAX_OPTIONS} at "

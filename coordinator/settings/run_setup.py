@@ -7,6 +7,7 @@ from dreamfleet.common.cli.config import Table, add_flags, configurable_fields, 
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.protocol.tasks import DREAM, is_shipped
 from dreamfleet.common.runs.records import EXTERNAL
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE, RunConfig
 from dreamfleet.coordinator.settings.limits import LimitsConfig
@@ -48,6 +49,7 @@ def load_run_config(args: argparse.Namespace, base: Table) -> tuple[RunConfig, L
     """What a new run is, and when it ends, as its flags, the environment and the file say."""
     _check_tables(args.sources["file"] or {})
     config = _with_subspace(_with_stages(args, load(RunConfig, "run", base=base, preset=find_preset, **args.sources)))
+    _check_effects(args, config)
     limits = load(LimitsConfig, "limits", **args.sources)
     check_limits(limits, config.evaluate_every, is_external=config.optimiser == EXTERNAL)
     return config, limits
@@ -72,6 +74,21 @@ def _with_stages(args: argparse.Namespace, config: RunConfig) -> RunConfig:
     return replace(config, stages=found)
 
 
+def _check_effects(args: argparse.Namespace, config: RunConfig) -> None:
+    """`UsageError` for a flag that changes nothing beside the run's other settings; a file may serve many runs."""
+    dreams = config.task == DREAM or (config.task is not None and not is_shipped(config.task))
+    needs = {
+        "temperature": (dreams, f"--task {DREAM}"),
+        "features": ("features" not in args.given or not config.needs_no_bundle, "a world model"),
+        "collect_episodes": (config.collect_every, "--collect-every"),
+        "evaluation_episodes": (config.evaluate_every, "--evaluate-every"),
+        "confirm_episodes": (config.evaluate_every or not config.confirm_episodes, "--evaluate-every"),
+    }
+    for name, (has_effect, needed) in needs.items():
+        if name in args.given and not has_effect:
+            raise UsageError(f"--{name.replace('_', '-')} changes nothing without {needed}: give that, or omit this")
+
+
 def _with_subspace(config: RunConfig) -> RunConfig:
     from dreamfleet.common.runs.lookup import find_subspace
 
@@ -83,11 +100,12 @@ def _with_subspace(config: RunConfig) -> RunConfig:
 
 
 def check_limits(limits: LimitsConfig, evaluate_every: int, *, is_external: bool) -> None:
-    """`UsageError` for a target score where no mean is ever evaluated, and for any limit of an external run."""
+    """`UsageError` for a limit by evaluated means where none is ever evaluated, and for any of an external run."""
     if is_external and limits != LimitsConfig():
         raise UsageError(
             f"a run with --optimiser {EXTERNAL} has no limits: it waits for batches until `dreamfleet stop`, so leave "
             "--generations, --steps, --minutes, --target and --parted out"
         )
-    if limits.target is not None and not evaluate_every:
-        raise UsageError("--target is reached by an evaluated mean: give --evaluate-every too")
+    if (limits.target is not None or limits.parted) and not evaluate_every:
+        flag = "--parted" if limits.target is None else "--target"
+        raise UsageError(f"{flag} is reached by evaluated means: give --evaluate-every too")

@@ -41,6 +41,8 @@ from tests.support.frozen_settings import comes_back
         ({}, 867),
         ({"features": "z"}, 99),
         ({"controller": "hidden"}, 8 * 289 + 3 * 9),
+        ({"hidden_units": 24, "features": "z"}, 867),
+        ({"controller": "linear"}, 867),
         ({"controller": "hidden", "hidden_units": 24, "features": "z"}, 867),  # as long as the linear one on z and h
     ],
 )
@@ -48,7 +50,7 @@ def test_a_runs_controller_is_as_configured_and_journalled(random_bundle, flags,
     config = RunConfig(bundle=str(random_bundle.path), **flags)
     settings = freeze(config, random_bundle)
     assert settings.controller.size == size
-    assert (settings.task.controller is None) == (not flags)
+    assert (settings.task.controller is None) == (settings.controller == random_bundle.default_shape)
     assert comes_back(settings, random_bundle)
 
 
@@ -59,6 +61,14 @@ def test_a_preset_of_a_run_is_one_that_can_begin_and_be_configured_again(name):
     loaded_subspace = find_subspace(preset["subspace"]) if "subspace" in preset else None
     settings = freeze(RunConfig(**preset, loaded_subspace=loaded_subspace), bundle)
     assert comes_back(settings, bundle, loaded_subspace=loaded_subspace)
+
+
+@pytest.mark.parametrize(
+    "sources", [{"file": {"run": {"hidden_units": 16}}}, {"environment": {"DREAMFLEET_RUN_HIDDEN_UNITS": "16"}}]
+)
+def test_units_of_a_layer_make_the_layer_wherever_they_are_given(sources):
+    config = load(RunConfig, "run", **sources, base={"task": "gym:CartPole-v1"})
+    assert freeze(config, None).controller.hidden == 16
 
 
 def test_a_run_that_says_nothing_keeps_the_words_of_the_first_version(random_bundle):
@@ -142,6 +152,7 @@ def test_a_run_of_task_dream_that_drives_too_may_charge_its_drives(random_bundle
         ({"population": 10**11}, "--population .*100000"),
         ({"hidden_units": 10**12}, "--hidden-units .*100000"),
         ({"hidden_units": 0}, "--hidden-units .*100000"),
+        ({"controller": "linear", "hidden_units": 16}, "--hidden-units .*--controller"),
         *(({"temperature": each}, "--temperature") for each in (0.0, -1.0, 5000.0, float("nan"), float("inf"))),
         ({"sigma0": 1e300}, "--sigma0"),
         ({"task": ""}, r"\bgym\b"),
