@@ -101,7 +101,7 @@ def _compare_sweeps(args: argparse.Namespace, names: Sequence[str]) -> int:
 
 
 def _compare_reports(args: argparse.Namespace, paths: Sequence[Path]) -> int:
-    """Print each mean, and its difference from the first on equal seeds."""
+    """Print each mean, and its difference from the first on equal seeds if both are of one world and direction."""
     (first, base), *others = [(path, read_evaluation_report(path)) for path in paths]
     lines, rows = [_line(first, base)], []
     for path, each in others:
@@ -110,10 +110,16 @@ def _compare_reports(args: argparse.Namespace, paths: Sequence[Path]) -> int:
             one, other = getattr(base, what), getattr(each, what)
             note = f"note: {first} and {path} are of different {OTHER_CAUSES[what]}: {one!r} and {other!r}"
             print(note, file=sys.stderr)
-        found = PairedDifference.between(base.results, each.results)
-        text = found.describe(minimised=base.results.minimised and each.results.minimised)
+        figures: dict[str, Any] = {}
+        if base.world != each.world:
+            text = "scores of different worlds are not compared"
+        elif base.results.minimised != each.results.minimised:
+            text = "one is minimised and another is not: their values are not compared"
+        else:
+            found = PairedDifference.between(base.results, each.results)
+            text = found.describe(minimised=base.results.minimised)
+            figures = {**asdict(found), "clear": found.is_significant}
         lines += [_line(path, each), f"{path} less {first}: {text}"]
-        figures = {**asdict(found), "clear": found.is_significant}
         rows.append({"report": path, "against": first, **figures, "differing_facts": differing})
     print_answer(args, "\n".join(lines), differences=rows)
     return 0

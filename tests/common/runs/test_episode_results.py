@@ -200,6 +200,17 @@ def test_other_differences_than_the_controllers_are_noted(tmp_path, capsys, chan
     assert command_line.main(["compare", *paths, "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["differences"]
     assert [each["differing_facts"] for each in rows] == [[], differing]
+    assert ["clear" in each for each in rows] == [True, "world" not in changes]
+
+
+def test_scores_of_different_worlds_or_directions_have_no_difference(tmp_path, capsys):
+    least = {"task": "function:mine:cost", "options": '{"environment": {"x0": [0], "minimise": true}}'}
+    paths = [str(tmp_path / f"{name}.json") for name in "abc"]
+    for path, each in zip(paths, [{}, {"first": 50_000, "world": "takecover"}, least], strict=True):
+        Path(path).write_text(scored(1, 2, **each).to_json())
+    assert command_line.main(["compare", *paths, "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["differences"]
+    assert [{"clear", "mean", "error", "seeds"} & each.keys() for each in rows] == [set(), set()]
 
 
 ELSEWHERE, FAILS_NOW = {"fingerprint": "aarch64"}, (FailedEpisode(10_002, "E: x"),)
