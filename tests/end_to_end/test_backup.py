@@ -2,13 +2,17 @@
 
 import shlex
 import shutil
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from dreamfleet.common.runs.run_folder import open_run
-from dreamfleet.common.runs.run_paths import BUNDLE, ROLLOUTS
+from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL, ROLLOUTS, run_command
 from dreamfleet.coordinator.addons.runs import backup
+from dreamfleet.coordinator.run.recall import bar_stored
+from dreamfleet.coordinator.storage.journal import Journal
 from tests.support import tasks
 from tests.support.journals import change_journal
 from tests.support.processes import ROOT, call_here
@@ -49,6 +53,11 @@ def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, 
     assert outcome(processes, "test") == whole
     assert len(list((processes.runs / "test" / ROLLOUTS).iterdir())) == GENERATIONS
 
+    back = call_here("runs", "backup", "test", "--runs-dir", safe, "--to", processes.runs)
+    assert back[0] == 2, "what was continued is ahead"
+    assert outcome(processes, "test") == whole
+    assert back_up(processes, safe)[0] == 0
+
 
 @pytest.fixture
 def finished(processes):
@@ -88,6 +97,62 @@ def test_what_cannot_be_a_copy_is_left_alone(finished, tmp_path):
     assert (code, "/proc/nowhere" in err) == (1, True), err
     code, _, err = back_up(finished, tmp_path, name="nobody")
     assert (code, "'nobody'" in err) == (1, True), err
+
+
+def begin_again(folder):
+    """What each coordinator that resumes a run writes first."""
+    with closing(Journal(folder / JOURNAL)) as journal:
+        journal.begin_incarnation()
+        journal.commit()
+
+
+ADDED = {
+    "event": "1, 0.0, 1, 'incarnation 1 begins', '', ''",
+    "result": "randomblob(32), kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, "
+    "fingerprint, incarnation, host_class, measures FROM result",
+    "batch": "1, 'sent', x'', '[]', 0, NULL, 0.0, NULL, 'waiting', '{}'",
+}
+
+
+@pytest.mark.parametrize("ahead", [*ADDED, "copy", "both", "barred"])
+def test_a_copy_that_holds_what_its_run_does_not_is_kept(finished, safe, ahead):
+    """Also where both were continued, and where a damaged log took the run's own last results."""
+    source, copy = finished.runs / "test", safe / "test"
+    if ahead in ADDED:
+        change_journal(copy, f"INSERT INTO {ahead} SELECT {ADDED[ahead]} LIMIT 1")
+    elif ahead == "barred":
+        bar_stored(copy, "vm", is_barred=True)
+    else:
+        for each in (copy, source)[: 1 + (ahead == "both")]:
+            begin_again(each)
+    kept = (copy / JOURNAL).read_bytes()
+    code, _, err = back_up(finished, safe)
+    assert code == 2
+    for part in (str(copy), str(source), run_command(copy, "runs", "delete")):
+        assert part in err
+    assert [path.name for path in safe.iterdir()] == ["test"]
+    assert (copy / JOURNAL).read_bytes() == kept
+
+
+@pytest.mark.parametrize("change", [begin_again, partial(bar_stored, host="vm", is_barred=True)])
+def test_a_copy_that_is_behind_is_replaced_and_then_is_no_copy_to_go_back_from(finished, safe, change):
+    source, copy = finished.runs / "test", safe / "test"
+    change(source)
+    assert call_here("runs", "backup", "test", "--runs-dir", safe, "--to", finished.runs)[0] == 2
+    assert back_up(finished, safe)[0] == 0
+    with open_run(finished.runs, "test") as run, open_run(safe, "test") as copied:
+        assert copied.events() == run.events()
+        assert copied.result_count() == run.result_count()
+    change_journal(copy, "PRAGMA journal_mode = WAL")  # as where somebody continues it
+    assert call_here("runs", "backup", "test", "--runs-dir", safe, "--to", finished.runs)[0] == 0, "both are equal"
+
+
+def test_a_copy_that_cannot_be_compared_is_kept(finished, safe):
+    with (safe / "test" / JOURNAL).open("r+b") as file:
+        file.seek(8192)
+        file.write(bytes(200_000))
+    code, _, err = back_up(finished, safe)
+    assert (code, str(safe / "test") in err, (safe / "test" / JOURNAL).exists()) == (1, True, True), err
 
 
 def test_a_call_that_was_killed_between_two_names_is_made_good(finished, safe):

@@ -14,18 +14,32 @@ from pathlib import Path
 from dreamfleet.common.errors import ControllerError, JournalError, UsageError
 from dreamfleet.common.files.atomic_write import fsync_path
 from dreamfleet.common.files.locks import open_lock, try_lock
+from dreamfleet.common.printable import one_line, plural
 from dreamfleet.common.runs.lookup import load_controller_of
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_lock import run_lock
-from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, ROLLOUTS
+from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, ROLLOUTS, run_command
 from dreamfleet.coordinator.storage.journal_file import copy_database, sqlite_side_files
+
+# What an earlier copy has and a new one lacks. A run only ever adds events, but for the oldest ones, results, which a
+# recall sets aside, and batches. An event has its time: copies that were both continued share no later one.
+_EVENT = "SELECT number, happened, incarnation, text, what, worker FROM"
+_KEY = "kind, generation, candidate, episode, digest"  # by which nearly all are found; one may count elsewhere now
+LOST = (
+    f"SELECT * FROM ({_EVENT} earlier.event ORDER BY number DESC LIMIT 1) EXCEPT {_EVENT} main.event",  # noqa: S608
+    f"WITH own AS (SELECT {_KEY} FROM earlier.result UNION ALL SELECT {_KEY} FROM earlier.recalled) "  # noqa: S608
+    f"SELECT digest FROM own WHERE ({_KEY}) NOT IN (SELECT {_KEY} FROM main.result) "
+    "AND digest NOT IN (SELECT digest FROM main.recalled) EXCEPT SELECT digest FROM main.result",
+    "SELECT id FROM earlier.batch EXCEPT SELECT id FROM main.batch",
+)
 
 
 def back_up(source: RunFolder, target: Path) -> None:
     """Copy the run into the folder `target`, of its own name; an earlier copy of the same run there is replaced.
 
     Whatever ends this, one whole copy is left if there was one. `UsageError` for a target that is something else, a
-    run that is served from there, or the run itself; `JournalError` where the disk refuses.
+    copy that holds what the run does not, a run that is served from there, or the run itself; `JournalError` where
+    the disk refuses.
     """
     with _journal_errors(target):
         _check_target(source, target)
@@ -35,9 +49,10 @@ def back_up(source: RunFolder, target: Path) -> None:
         try:
             aside.mkdir(mode=0o700)
             _copy_run(source, aside)
-            # Nobody goes on from the earlier copy while it is replaced.
+            # Nobody goes on from the earlier copy while it is compared and replaced.
             with run_lock(target) if target.exists() else nullcontext():
                 if target.exists():
+                    _check_nothing_is_lost(source, target, aside)
                     target.rename(former)
                 aside.rename(target)
             fsync_path(target.parent)
@@ -83,6 +98,46 @@ def _check_target(source: RunFolder, target: Path) -> None:
     with open_run(target.parent, target.name) as other:
         if other.uid != source.uid:
             raise UsageError(f"{target} is another run of this name: name another folder with --to")
+
+
+def _check_nothing_is_lost(source: RunFolder, target: Path, new: Path) -> None:
+    """`UsageError` if the earlier copy in `target` holds what the new one does not.
+
+    It was continued or changed there, as each incarnation and each bar writes an event first. Or the run lost its last
+    results, such as with a damaged write-ahead log.
+    """
+    with RunFolder(target) as earlier, RunFolder(new) as copied:  # they are journals of ours
+        try:
+            is_lost = _is_lost(target / JOURNAL, new / JOURNAL)
+        except sqlite3.Error as error:
+            why = f"it cannot be compared: {one_line(str(error))}"
+            raise JournalError(f"{target} is kept, for {why}; {_other_ways(target)}") from error
+        if is_lost:
+            raise UsageError(
+                f"{target} is kept, for it holds what {source.path} does not: it is at {_describe(earlier)}, and "
+                f"{source.path} at {_describe(copied)}; {_other_ways(target)}"
+            )
+
+
+def _is_lost(earlier: Path, new: Path) -> bool:
+    """Whether the earlier journal holds what the new one does not."""
+    with closing(sqlite3.connect(_read_only(new), uri=True)) as database:
+        database.execute("ATTACH ? AS earlier", (_read_only(earlier),))
+        return any(database.execute(query).fetchone() for query in LOST)
+
+
+def _read_only(path: Path) -> str:
+    return f"{path.absolute().as_uri()}?mode=ro"
+
+
+def _describe(run: RunFolder) -> str:
+    generations, results = len(run.history()), run.result_count()
+    counts = f"{plural(generations, 'closed generation')}, {plural(results, 'result')}"
+    return f"incarnation {run.fact('incarnation') or 0} with {counts}"
+
+
+def _other_ways(target: Path) -> str:
+    return f"name another folder with --to, or remove it: `{run_command(target, 'runs', 'delete')}`"
 
 
 def _copy_run(source: RunFolder, folder: Path) -> None:
@@ -131,9 +186,8 @@ def _recalls(run: RunFolder) -> tuple[object, ...]:
 
 
 def _copy_journal(source: RunFolder, path: Path) -> None:
-    where = f"{(source.path / JOURNAL).absolute().as_uri()}?mode=ro"
     try:
-        with closing(sqlite3.connect(where, uri=True)) as live:
+        with closing(sqlite3.connect(_read_only(source.path / JOURNAL), uri=True)) as live:
             found, _ = copy_database(live, path)
     except sqlite3.Error as error:
         raise JournalError(f"the journal of run {source.name} cannot be copied to {path.parent}: {error}") from error
