@@ -275,7 +275,7 @@ class Run:
         """
         self.journal.verify(self.journal.path.parent)  # else what somebody wrote into it would be replayed, and sealed
         self._enter(self.state.rewind())
-        before = [*self.fleet.notes]
+        before = [*self.fleet.notes], [*self._notes]
         try:
             hosts = bar()
             self.fleet.note(recall(self.journal, self.settings, hosts), "recalled")
@@ -284,7 +284,7 @@ class Run:
             self.journal.commit()
         except NotWritableNowError as error:
             self.journal.forget_writes()
-            self.fleet.notes = before  # without that it was done
+            self.fleet.notes, self._notes = before  # without that it was done
             self.wait_until_writable(error)
             self._write_notes()  # so that the next commit fails too, until there is room
             return False

@@ -27,6 +27,7 @@ from tests.support.dispatched import result
 from tests.support.failing_runs import GENERATIONS, SETTINGS, Failing
 from tests.support.run_bench import A, B, Bench, result_of
 
+DONE = ("barred", "recalled")  # what the events of a recall are
 OPTIMISERS = ["cma", "full", "cmaes-lra", "openes", "pepg", "snes", "xnes"]
 
 
@@ -362,6 +363,7 @@ def test_a_bar_on_a_full_disk_is_refused_and_changes_nothing(begin, monkeypatch)
         assert bench.run.bar("a"), "it is not asked again while the disk is full"
     bench.wait(10.0)
     assert bench.run.commit()
+    assert [each.what for each in bench.run.take_notes() if each.what in DONE or each.what == "paused"] == ["paused"]
     with RunFolder(bench.path) as run:
         assert run.checks is None
         assert run.history() == before
