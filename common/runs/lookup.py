@@ -61,8 +61,9 @@ def find_agent(name: str, runs_dir: Path) -> tuple[Controller | TrainedAgent, Pa
             return Controller.load(folder / CONTROLLER), folder / BUNDLE
     if is_file(shipped):
         return Controller.load(shipped), None
-    if is_file(run / JOURNAL):
-        raise _no_controller_yet(run)
+    for folder in (run, path):
+        if is_file(folder / JOURNAL):
+            raise _no_controller_yet(folder.absolute())  # of which `.` has a name too
     if is_folder(path):
         raise ControllerError(f"{name} is a folder without {CONTROLLER}; {import_hint(path, '--out', 'OUT')}")
     names = ", ".join(sorted(each.stem for each in pretrained_folder().glob("*.npz"))) or "none"

@@ -93,7 +93,8 @@ def _rows(
         yield from ((name, as_text(text)) for name, text in describe_stages(settings, begun).items())
     else:
         yield "task", as_code(spec.task) + as_text(f", {view.steps}{warm}, version {spec.version}")
-        size = f"population {settings.population} x {plural(settings.episodes, 'episode')}, sigma0 {settings.sigma0:g}"
+        size = f"population {settings.population} x {plural(settings.episodes, 'episode')}"
+        size += f"{', racing' if settings.racing else ''}, sigma0 {settings.sigma0:g}"
         own = f"{settings.optimiser}, {settings.covariance}, {size}, {generations}"
         yield "search", as_text(f"{SUBMITTED}, {generations}" if settings.is_external else own)
     yield "failed candidates", as_text(describe_failed(settings, history, run.count_reseeds(history)))

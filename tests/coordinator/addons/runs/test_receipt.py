@@ -35,7 +35,7 @@ from dreamfleet.common.runs.effort import START_EFFORT, Effort
 from dreamfleet.common.runs.episode_results import EpisodeResult
 from dreamfleet.common.runs.records import StageSettings, StoredEvaluation, StoredGeneration, in_values
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.common.runs.run_paths import CONTROLLER
+from dreamfleet.common.runs.run_paths import CONTROLLER, resume_command
 from dreamfleet.common.runs.run_provenance import RECEIPT, RunProvenance, StartProvenance
 from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, VALIDATION, training_seeds
 from dreamfleet.common.schema.validation import to_plain
@@ -68,6 +68,24 @@ def receipt():
 def change_provenance(run, **changes):
     controller = Controller.load(run / CONTROLLER)
     replace(controller, provenance={**controller.provenance, **changes}).save(run / CONTROLLER)
+
+
+@pytest.mark.parametrize("name", ["runs/reality", "."])
+def test_until_a_barred_run_is_resumed_its_folder_names_the_command(reality, monkeypatch, name):
+    (reality / CONTROLLER).unlink()
+    monkeypatch.chdir(reality if name == "." else reality.parents[1])
+    code, _, err = call_here("evaluate", "--controller", name)
+    assert (code, resume_command(reality.absolute()) in err) == (1, True), err
+
+
+def test_it_says_that_a_run_raced(reality):
+    receipts = []
+    for racing in (True, False):
+        text = change_settings(reality, lambda settings: replace(settings, racing=racing))  # noqa: B023
+        change_provenance(reality, settings=json.loads(text))
+        receipts.append(printed("runs", "receipt", "reality"))
+    raced, plain = ({*each.splitlines()} for each in receipts)
+    assert len(raced - plain) == len(plain - raced) == 1
 
 
 def test_it_says_what_a_paper_cites(reality):
