@@ -1,6 +1,7 @@
 """Whether a folder's file system keeps the locks that a journal needs; network file systems may not."""
 
 import fcntl
+import shutil
 import sqlite3
 import tempfile
 from contextlib import closing, suppress
@@ -12,6 +13,7 @@ NETWORK = frozenset({
     "orangefs", "panfs", "pvfs2", "smb3", "smbfs", "wekafs",
 })  # fmt: skip
 ROOM = 1 << 18  # bytes that the trial needs
+LEAST_ROOM = 1 << 16  # bytes; the index of a write-ahead log has half of them
 REMEDY = (
     "choose a --runs-dir on a local disk, such as $TMPDIR or the node's /scratch, and copy the run's folder from there "
     "when its coordinator has ended"
@@ -47,6 +49,17 @@ def lock_problem(folder: Path) -> str:
     kind = file_system_type(where)
     on = f", a network file system ({kind})" if is_network(kind) else f" ({kind})" if kind else ""
     return f"locks fail on {where}{on}: {failure}; {REMEDY}"
+
+
+def disk_problem(folder: Path) -> str:
+    """Why SQLite may have had an I/O error in a folder, with the remedy: no room, or no locks; empty if neither.
+
+    It calls a disk full where it writes a database, but not where it finds no room for the log's index.
+    """
+    with suppress(OSError):
+        if shutil.disk_usage(folder).free < LEAST_ROOM:
+            return "the disk is full: make room"
+    return lock_problem(folder)
 
 
 def _lock_failure(folder: Path) -> str:

@@ -6,7 +6,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 from dreamfleet.common.errors import DamagedJournalError, DreamfleetError, JournalError, NotWritableNowError
-from dreamfleet.common.files.file_system import lock_problem
+from dreamfleet.common.files.file_system import disk_problem
 from dreamfleet.common.files.sqlite import is_damage
 from dreamfleet.common.printable import one_line
 
@@ -64,7 +64,7 @@ def journal_errors(path: Path) -> Iterator[None]:
             ) from error
         if (remedy := REMEDIES.get(getattr(error, "sqlite_errorcode", 0) & 0xFF)) is not None:
             raise NotWritableNowError(f"cannot write {path}: {error}; {remedy}") from error
-        problem = f"; {text}" if (text := lock_problem(path.parent)) else ""
+        problem = f"; {text}" if (text := disk_problem(path.parent)) else ""
         raise JournalError(
             f"cannot write {path}: {error}; nothing counted that was not written before{problem}"
         ) from error

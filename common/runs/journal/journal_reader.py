@@ -9,7 +9,7 @@ from types import NoneType
 from typing import Any
 
 from dreamfleet.common.errors import DamagedJournalError, JournalError
-from dreamfleet.common.files.file_system import lock_problem
+from dreamfleet.common.files.file_system import disk_problem, lock_problem
 from dreamfleet.common.files.regular_files import check_regular
 from dreamfleet.common.files.sqlite import ThreadConnections, is_damage, is_locked
 from dreamfleet.common.printable import one_line
@@ -204,7 +204,8 @@ def _roll_back(path: Path) -> None:
 
 def _describe_with_remedy(error: Exception, path: Path) -> str:
     code = getattr(error, "sqlite_errorcode", 0) & 0xFF
-    if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_IOERR) and (problem := lock_problem(path.parent)):
+    causes = {sqlite3.SQLITE_BUSY: lock_problem, sqlite3.SQLITE_IOERR: disk_problem}
+    if (find := causes.get(code)) and (problem := find(path.parent)):
         return f"{one_line(str(error))}; {problem}"
     if code == sqlite3.SQLITE_CANTOPEN and _has_log(path):
         return f"its last part is in {path.name}-wal, which cannot be read in a read-only folder: copy the folder first"

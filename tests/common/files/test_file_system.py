@@ -3,17 +3,25 @@
 import errno
 import os
 import re
+import shutil
+import sqlite3
 import sys
 import tempfile
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
-from dreamfleet.common.errors import DreamfleetError, UsageError
+from dreamfleet.common.errors import DreamfleetError, JournalError, UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, open_output
-from dreamfleet.common.files.file_system import file_system_type, is_network, lock_problem
+from dreamfleet.common.files.file_system import LEAST_ROOM, disk_problem, file_system_type, is_network, lock_problem
+from dreamfleet.common.runs.journal import schema
+from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.run_paths import JOURNAL
+from dreamfleet.coordinator.storage.journal import Journal
 from tests.support.no_locks import UNAVAILABLE
+from tests.support.processes import ROOT
 from tests.support.tables import cells
 
 LIST = """\
@@ -46,6 +54,21 @@ def test_the_longest_and_last_mount_says_the_type(tmp_path):
 def test_locks_work_here_and_the_trial_leaves_nothing(tmp_path):
     assert lock_problem(tmp_path / "runs" / "night") == ""
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("free", [0, LEAST_ROOM])
+def test_an_error_for_want_of_room_names_the_full_disk(tmp_path, monkeypatch, free):
+    shutil.copytree(ROOT / "tests" / "fixtures" / "runs" / "dream", tmp_path / "night")
+    error = sqlite3.OperationalError("disk I/O error")
+    error.sqlite_errorcode = sqlite3.SQLITE_IOERR_SHMSIZE
+    monkeypatch.setattr(schema, "check_schema", Mock(side_effect=error))
+    monkeypatch.setattr(shutil, "disk_usage", Mock(return_value=Mock(free=free)))
+    problem = disk_problem(tmp_path)
+    assert bool(problem) == (free < LEAST_ROOM)
+    for opened in (RunFolder, lambda folder: Journal(folder / JOURNAL)):
+        with pytest.raises(JournalError) as said:
+            opened(tmp_path / "night")
+        assert str(said.value).endswith(problem)
 
 
 @pytest.mark.slow
