@@ -25,6 +25,8 @@ SIDES = ("common", "coordinator", "worker", "dreamfleet/experiments")  # and the
 # Words that a reader has to read twice; `style` in CONTRIBUTING.md says what to write instead.
 RIDDLES = re.compile(r"\b(tell|tells|telling|told|untold|whoever|whomever)\b|\b(?:is|are|was|were|be|been) had\b")
 LONG_FILE = 400
+PAGE = r"\bdocs/[\w/-]+\.md\b"  # as docstrings name it
+MANY = 4  # words of a text that a page would not have by chance
 GENERIC = ("run", "configure", "load", "option")  # functions of many files
 # The worlds that ship: what names each of them, and its rooms, the files and folders in which that may stand.
 WORLDS = {
@@ -293,7 +295,7 @@ def about(path: Path) -> dict[str, list[str]]:
     worlds = [
         f"(?i:{name.pattern})" for name, rooms in WORLDS.items() if any(path.is_relative_to(room) for room in rooms)
     ]
-    pages = re.findall(r"docs/[\w/-]+\.md", text)
+    pages = re.findall(PAGE, text + (ROOT / room).read_text())
     in_code = re.compile("|".join([named, *calls, *written]))
     in_pages = re.compile("|".join([named, *written, *codes, *worlds]))
     own_test = Path(f"tests/{path.parent}/test_{path.name}".replace("dreamfleet/", ""))
@@ -318,6 +320,9 @@ def about(path: Path) -> dict[str, list[str]]:
         for name, value in of.items()
         if value.partition(":")[0] in reached
     ]
+    said = {" ".join(each.split()) for each in words_of(path) if len(each.split()) >= MANY}
+    flat = {name: " ".join(page.split()) for name, page in documents.items()}
+    quoted = {name for name, page in flat.items() if any(map(page.__contains__, said))}
     return {
         str(path): [ast.get_docstring(ast.parse(text)) or ""],
         str(path.parent): [ast.get_docstring(ast.parse((ROOT / room).read_text())) or "", listed, kind],
@@ -328,7 +333,7 @@ def about(path: Path) -> dict[str, list[str]]:
         "reached by the entry points": points,
         "and by the verbs (docs/reference/verbs.md)": [", ".join(near) if len(near) <= 12 else "most of them"],
         "named in": [
-            *(name for name, page in documents.items() if name in pages or in_pages.search(page)),
+            *(name for name, page in documents.items() if name in {*pages, *quoted} or in_pages.search(page)),
             *(name for name, script in scripts.items() if in_code.search(script)),
         ],
     }

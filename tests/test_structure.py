@@ -181,3 +181,8 @@ def test_no_test_module_imports_another():
     imports = re.compile(r"^ *from tests\.?[\w.]*(\.test_\w+ import| import .*\btest_)", re.MULTILINE)
     importing = [str(path) for path in sources("tests") if imports.search((ROOT / path).read_text())]
     assert importing == [], "what tests share lies in tests/support"
+
+
+def test_pages_that_docstrings_name_are_there():
+    named = {page for path in sources(*SIDES) for page in re.findall(structure.PAGE, (ROOT / path).read_text())}
+    assert {page for page in named if not (ROOT / page).exists()} == set()

@@ -1,4 +1,7 @@
-"""Files that a run reads and writes: bundles, controllers, agents, subspaces."""
+"""Files that a run reads and writes: bundles, controllers, agents, subspaces.
+
+Its pages: docs/reference/files.md, docs/reference/worlds.md, docs/reference/import.md, docs/explanation/determinism.md.
+"""
 
 __all__ = [
     "controller",

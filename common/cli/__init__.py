@@ -1,4 +1,8 @@
-"""The command line: verbs, settings, output, progress."""
+"""The command line: verbs, settings, output, progress.
+
+Its pages: docs/how-to/configure.md, docs/reference/settings.md, docs/reference/exit-codes.md,
+docs/reference/presets.md.
+"""
 
 __all__ = [
     "command_line",

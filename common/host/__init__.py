@@ -1,4 +1,7 @@
-"""The host and its processes: resource limits, signals, logs, streams, child processes."""
+"""The host and its processes: resource limits, signals, logs, streams, child processes.
+
+Its pages: docs/reference/platforms.md, docs/how-to/unattended.md.
+"""
 
 __all__ = [
     "processes",

@@ -1,4 +1,7 @@
-"""The Zenoh protocol: keys, messages, their encoding and their bounds."""
+"""The Zenoh protocol: keys, messages, their encoding and their bounds.
+
+Its pages: docs/reference/protocol.md, docs/reference/glossary.md.
+"""
 
 __all__ = [
     "keys",

@@ -1,4 +1,7 @@
-"""Runs on disk: their journals as typed records, schedules, provenance and evaluation reports."""
+"""Runs on disk: their journals as typed records, schedules, provenance and evaluation reports.
+
+Its pages: docs/reference/files.md, docs/how-to/stages.md, docs/how-to/stop-and-resume.md, docs/reference/settings.md.
+"""
 
 __all__ = [
     "run_folder",

@@ -1,3 +1,6 @@
-"""Conversion of plain data to typed objects and back: validation, bounds, optional fields."""
+"""Conversion of plain data to typed objects and back: validation, bounds, optional fields.
+
+Its pages: docs/reference/protocol.md.
+"""
 
 __all__ = ["validation", "display", "times"]

@@ -1,3 +1,6 @@
-"""Zenoh sessions, endpoints, queries and the router."""
+"""Zenoh sessions, endpoints, queries and the router.
+
+Its pages: docs/how-to/router.md, docs/reference/protocol.md, docs/explanation/threats.md.
+"""
 
 __all__ = ["session", "query", "network"]

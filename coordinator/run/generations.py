@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dreamfleet.common.client.elites import EliteArchive
+from dreamfleet.common.client.elite_archive import EliteArchive
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.protocol.tasks import is_function_task
 from dreamfleet.common.runs.records import RunSettings, StoredEvaluation, StoredGeneration

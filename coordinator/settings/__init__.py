@@ -1,4 +1,7 @@
-"""What a run is: settings, presets, schedule, starting point, how it is resumed or rerun."""
+"""What a run is: settings, presets, schedule, starting point, how it is resumed or rerun.
+
+Its pages: docs/reference/settings.md, docs/reference/presets.md, docs/how-to/stages.md.
+"""
 
 __all__ = [
     "config",

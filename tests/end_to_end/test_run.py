@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import dreamfleet
-from dreamfleet.common.addons.analysis.elites import RunArchive
+from dreamfleet.common.addons.analysis.run_archive import RunArchive
 from dreamfleet.common.protocol.stop_kind import StopKind
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.transport.session import Network, open_session

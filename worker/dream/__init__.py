@@ -7,6 +7,8 @@ Importing this registers `dreamfleet/Dream-v0` for the world of any bundle, also
 >>> environment = gymnasium.make("dreamfleet/Dream-v0", bundle="tiny", temperature=1.2)
 >>> environment.metadata["render_fps"]
 50
+
+Its pages: docs/explanation/dreams.md, docs/reference/tasks.md, docs/reference/worlds.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Tasks: the contract between an environment, a policy and the rest of the system, and finding tasks by name."""
+"""Tasks: the contract between an environment, a policy and the rest of the system, and finding tasks by name.
+
+Its pages: docs/reference/tasks.md, docs/reference/python.md.
+"""
 
 __all__ = [
     "api",

@@ -1,4 +1,7 @@
-"""From nothing to a bundle: collect, train the VAE, encode, train the MDN-RNN, bundle."""
+"""From nothing to a bundle: collect, train the VAE, encode, train the MDN-RNN, bundle.
+
+Its pages: docs/how-to/train.md, docs/reference/presets.md, docs/tutorials/own-world-model.md.
+"""
 
 __all__ = [
     "presets",

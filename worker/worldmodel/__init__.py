@@ -1,6 +1,8 @@
 """The world model: frozen in ONNX Runtime for inference, as torch modules for training, and the export between them.
 
 What `scoring` imports of it has no torch.
+
+Its pages: docs/explanation/determinism.md, docs/reference/worlds.md, docs/reference/import.md, docs/how-to/train.md.
 """
 
 import os

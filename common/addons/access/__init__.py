@@ -1,3 +1,6 @@
-"""Join files: an authority issues, lists and revokes them."""
+"""Join files: an authority issues, lists and revokes them.
+
+Its pages: docs/how-to/security.md, docs/how-to/share-a-fleet.md.
+"""
 
 __all__ = ["verb"]

@@ -1,3 +1,6 @@
-"""A Zenoh router between hosts that do not reach each other."""
+"""A Zenoh router between hosts that do not reach each other.
+
+Its pages: docs/how-to/router.md, docs/how-to/security.md.
+"""
 
 __all__ = ["verb"]

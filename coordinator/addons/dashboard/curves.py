@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from dreamfleet.common.addons.analysis.elites import exploration_note
+from dreamfleet.common.addons.analysis.run_archive import exploration_note
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.function_values import (
     fitness_word,

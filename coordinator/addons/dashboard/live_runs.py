@@ -9,7 +9,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
-from dreamfleet.common.addons.analysis.elites import RunArchive
+from dreamfleet.common.addons.analysis.run_archive import RunArchive
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.client.status import Population, Status, WorkerStatus, read_document, read_status
 from dreamfleet.common.errors import AccessError, ConnectionFailedError, DreamfleetError, HandshakeRejectedError

@@ -8,10 +8,10 @@ from math import isnan
 from pathlib import Path
 from typing import Any
 
-from dreamfleet.common.addons.analysis.elites import RunArchive
+from dreamfleet.common.addons.analysis.run_archive import RunArchive
 from dreamfleet.common.addons.analysis.scored_history import scored_history
 from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.client.elites import Elite
+from dreamfleet.common.client.elite_archive import Elite
 from dreamfleet.common.client.run_view import RunView
 from dreamfleet.common.errors import DreamfleetError, JournalError
 from dreamfleet.common.printable import format_duration, printable

@@ -1,3 +1,6 @@
-"""Optimisers beside CMA-ES."""
+"""Optimisers beside CMA-ES.
+
+Its pages: docs/reference/optimisers.md.
+"""
 
 __all__ = ["cmaes_library", "search_gradients"]

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from dreamfleet.common.addons.analysis.elites import RunArchive
+from dreamfleet.common.addons.analysis.run_archive import RunArchive
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import format_number
 from dreamfleet.common.protocol.measures import Axis, describe_measure

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from dreamfleet.common.addons.analysis.elites import RunArchive, tables
+from dreamfleet.common.addons.analysis.run_archive import RunArchive, tables
 from dreamfleet.common.addons.analysis.scored_history import scored_history
 from dreamfleet.common.errors import MissingExtraError, UsageError
 from dreamfleet.common.files.atomic_write import open_output, reporting_write_errors

@@ -12,7 +12,6 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.legend import Legend
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from dreamfleet.common.addons.analysis.elites import RunArchive, exploration_note
 from dreamfleet.common.addons.analysis.fitness_chart import (
     PLAIN,
     PLOT_COLOURS,
@@ -23,6 +22,7 @@ from dreamfleet.common.addons.analysis.fitness_chart import (
     seeds_note,
 )
 from dreamfleet.common.addons.analysis.learning import LearningCurve
+from dreamfleet.common.addons.analysis.run_archive import RunArchive, exploration_note
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import open_output
 from dreamfleet.common.host.add_ons import add_on

@@ -7,7 +7,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dreamfleet.common.addons.analysis.elites import RunArchive
+from dreamfleet.common.addons.analysis.run_archive import RunArchive
 from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.client.equal_fitness import EqualFitness
 from dreamfleet.common.client.run_view import RunView

@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from dreamfleet.common.addons.analysis.elites import RunArchive, controller_of, tables
+from dreamfleet.common.addons.analysis.run_archive import RunArchive, controller_of, tables
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import JournalError, MissingExtraError, UsageError

@@ -1,4 +1,7 @@
-"""What experiments stand on: processes of this host, their command lines, kept documents, arguments of searches."""
+"""What experiments stand on: processes of this host, their command lines, kept documents, arguments of searches.
+
+Its pages: docs/reference/python.md.
+"""
 
 __all__ = [
     "local_run",

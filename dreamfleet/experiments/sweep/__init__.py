@@ -1,3 +1,6 @@
-"""Many runs that differ in a few settings, on one fleet."""
+"""Many runs that differ in a few settings, on one fleet.
+
+Its pages: docs/how-to/sweep.md.
+"""
 
 __all__ = ["display", "runner", "figure", "folder", "summary", "plan"]

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dreamfleet.common.addons.analysis.elites import find_elite
+from dreamfleet.common.addons.analysis.run_archive import find_elite
 from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
 from dreamfleet.common.cli.key_values import ENVIRONMENT_EXAMPLE, parse_arguments

@@ -1,3 +1,6 @@
-"""Controllers, world models and drives of other projects, read as data and never executed."""
+"""Controllers, world models and drives of other projects, read as data and never executed.
+
+Its pages: docs/reference/import.md.
+"""
 
 __all__ = ["verb"]

@@ -1,3 +1,6 @@
-"""Videos of drives and dreams."""
+"""Videos of drives and dreams.
+
+Its pages: docs/tutorials/first-drive.md, docs/reference/worlds.md.
+"""
 
 __all__ = ["verb", "recording", "drive_frames", "canvas", "parallel_dream", "video"]

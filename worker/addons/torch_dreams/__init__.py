@@ -1,3 +1,6 @@
-"""Dreams on a torch device."""
+"""Dreams on a torch device.
+
+Its pages: docs/how-to/gpu.md, docs/explanation/determinism.md.
+"""
 
 __all__ = ["torch_batch"]

@@ -1,4 +1,7 @@
-"""A data set of recorded drives: collected, stored, read."""
+"""A data set of recorded drives: collected, stored, read.
+
+Its pages: docs/how-to/train.md, docs/reference/files.md.
+"""
 
 __all__ = [
     "dataset",

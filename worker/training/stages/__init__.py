@@ -1,4 +1,7 @@
-"""The stages that make a world model, as functions: a typed request in, a typed report out. Verbs parse and print."""
+"""The stages that make a world model, as functions: a typed request in, a typed report out. Verbs parse and print.
+
+Its pages: docs/how-to/train.md, docs/how-to/rounds.md.
+"""
 
 from dataclasses import asdict, dataclass
 from typing import Any

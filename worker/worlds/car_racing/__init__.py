@@ -4,6 +4,8 @@ Importing this registers `dreamfleet/CarRacing-v3` and `dreamfleet/CarRacingLate
 
 >>> import gymnasium, dreamfleet.worker.worlds.car_racing
 >>> environment = gymnasium.make("dreamfleet/CarRacing-v3")
+
+Its pages: docs/reference/tasks.md, docs/explanation/sources.md, docs/lab/operations-notes.md.
 """
 
 from __future__ import annotations

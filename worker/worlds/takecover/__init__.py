@@ -1,6 +1,6 @@
 """ViZDoom's Take Cover: a player who can only step aside lives as long as no fireball hits.
 
-docs/reference/tasks.md describes what people see of it.
+Its pages: docs/reference/tasks.md, docs/lab/takecover.md.
 """
 
 __all__ = ["task"]

@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from dreamfleet.common.addons.analysis.elites import RunArchive
-from dreamfleet.common.client.elites import Elite
+from dreamfleet.common.addons.analysis.run_archive import RunArchive
+from dreamfleet.common.client.elite_archive import Elite
 from dreamfleet.common.client.status import ArchiveStatus
 from dreamfleet.common.protocol.measures import parse_axes
 from dreamfleet.common.protocol.messages import Result

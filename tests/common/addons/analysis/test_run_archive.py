@@ -1,9 +1,9 @@
-"""Reading an archive from a journal: cells by number and by values. Tests elites.py and common/client/elites.py."""
+"""Reading an archive from a journal: cells by number and by values. Tests common/client/elite_archive.py."""
 
 import pytest
 
-from dreamfleet.common.addons.analysis.elites import RunArchive, tables
-from dreamfleet.common.client.elites import Elite
+from dreamfleet.common.addons.analysis.run_archive import RunArchive, tables
+from dreamfleet.common.client.elite_archive import Elite
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.measures import parse_axes
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.client.elites import Elite, EliteArchive
+from dreamfleet.common.client.elite_archive import Elite, EliteArchive
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import format_number
 from dreamfleet.common.runs.records import RunSettings
