@@ -15,6 +15,7 @@ from dreamfleet.common.runs.effort import format_steps
 from dreamfleet.common.runs.records import in_values
 
 PACE_WINDOW = 10  # closed generations that tell the pace
+SLOWER = 1.5  # times the pace that the present workers need, from which on they set it: less is noise of episodes
 STALL_SECONDS = 60.0  # how long a generation that is overdue makes no step until its end is unknown
 ACTIVE_STATES = ("running", "evaluating")
 SEARCH, DONE = "search", "search done"
@@ -51,7 +52,7 @@ class Eta:
 
     limits: tuple[Limit, ...]  # countable ones, the nearest first; none once the search is done
     others: tuple[str, ...]  # limits whose time cannot be estimated, in words
-    pace: float | None  # seconds a generation; `None` before the first is closed
+    pace: float | None  # seconds a future generation; `None` before the first is closed
     share: float | None  # of the time to the end that is over, from 0 to 1; `None` if no end is known
     rest: tuple[Rest, ...]  # the parts that are left; none while nobody scores or nothing moves
 
@@ -84,12 +85,13 @@ def estimate_eta(status: Status) -> Eta:
     limits = tuple(_counted_limits(status, pace, next_seconds))
     if next_seconds is not None:
         limits = tuple(sorted(limits, key=lambda each: math.inf if each.seconds is None else each.seconds))
+    shown = None if pace is None else next_seconds
     nearest = min((each.seconds for each in limits if each.seconds is not None), default=None)
     rest = () if nearest is None else (Rest(SEARCH, nearest), *judging)
     others = tuple(_uncounted_limits(status))
     if not limits and not others:
         others = ("no limit: it runs until it is stopped",)
-    return Eta(limits, others, pace, _share(status, limits, rest), rest if _moves(status, pace) else ())
+    return Eta(limits, others, shown, _share(status, limits, rest), rest if _moves(status, pace) else ())
 
 
 def _total(rest: tuple[Rest, ...]) -> float | None:
@@ -139,10 +141,10 @@ def _pace(status: Status) -> float | None:
 
 
 def _next_generation_seconds(status: Status, pace: float | None) -> float | None:
-    """Seconds of a future generation: those of the last ones, or more if fewer workers are present now."""
+    """Seconds of a future generation: those of the last ones, or more if clearly fewer workers are present now."""
     rate = status.throughput.episodes_per_second
     needed = status.generation.episodes / rate if rate else None
-    return max((each for each in (pace, needed) if each is not None), default=None)
+    return needed if pace is None or (needed is not None and needed > SLOWER * pace) else pace
 
 
 def _open_generation_seconds(status: Status, pace: float | None) -> float | None:

@@ -15,6 +15,7 @@ UNKNOWN_LINK = 32_000.0  # bytes a second: assumed of a link before the first me
 RATE_DECAY = 0.95  # factor of the best measured rate at each new measurement
 RISING, FALLING = 0.5, 0.2  # weights of a slower and of a faster new value in a moving mean
 GROWTH, SHRINKING = 0.9, 0.25  # exponents: expected time of more, and of fewer, jobs than ever measured
+DURATIONS = 64  # jobs whose mean says how long one takes: episodes of one task may differ tenfold
 SHORTEST = 1e-9  # seconds that a turnaround counts at least
 TURNAROUND_MEMORY = 60.0  # seconds that a turnaround is remembered after a newer one
 DEVIATIONS = 2.0  # above the mean that are still expected, like TCP's retransmission timer (RFC 6298: four)
@@ -43,6 +44,19 @@ class Turnaround:
         return self.mean + DEVIATIONS * self.deviation
 
 
+@dataclass(frozen=True)
+class JobDuration:
+    """Mean seconds that a job takes a slot, over about the last `DURATIONS` jobs."""
+
+    mean: float | None = None
+    jobs: int = 0
+
+    def with_job(self, seconds: float) -> JobDuration:
+        """The mean with one more job."""
+        jobs, before = min(self.jobs + 1, DURATIONS), seconds if self.mean is None else self.mean
+        return JobDuration(before + (seconds - before) / jobs, jobs)
+
+
 @dataclass
 class HostStats:
     """One host's record; `turnarounds` by size class, the logarithm to base 2 of the number of jobs, rounded up."""
@@ -53,8 +67,8 @@ class HostStats:
     losses: int = 0  # how often it was lost with jobs in hand
     mean_lifetime: float = math.inf  # seconds, of the workers that were lost
     steps_per_second: float = 0.0  # environment steps a second of one of its slots
-    job_seconds: float | None = None  # seconds that a candidate's job takes one of its slots
-    evaluation_seconds: float | None = None  # the same of an evaluation's
+    scoring: JobDuration = JobDuration()  # of a candidate's job
+    evaluation: JobDuration = JobDuration()
     round_trip: float | None = None  # seconds until a heartbeat confirmed a batch, at best
 
     def copy(self) -> HostStats:
@@ -127,9 +141,9 @@ class HostStats:
     def record_duration(self, kind: Kind, seconds: float) -> None:
         """Note how long a job of this kind took a slot."""
         if kind == "score":
-            self.job_seconds = _smoothed(self.job_seconds, seconds)
+            self.scoring = self.scoring.with_job(seconds)
         elif kind == "evaluate":
-            self.evaluation_seconds = _smoothed(self.evaluation_seconds, seconds)
+            self.evaluation = self.evaluation.with_job(seconds)
 
     def record_round_trip(self, seconds: float) -> None:
         """Note the time from sending a batch to its confirmation."""
@@ -167,7 +181,3 @@ class HostRecords:
 
 def _size_class(jobs: int) -> int:
     return max(jobs - 1, 0).bit_length()
-
-
-def _smoothed(before: float | None, seconds: float) -> float:
-    return seconds if before is None else before + FALLING * (seconds - before)

@@ -192,8 +192,8 @@ def _throughput(run: Run, present: Sequence[Member]) -> Throughput:
         steps_per_second=round(rate, 1),
         environment_steps=steps,
         seconds=min(round(run.history.seconds, 1), MAX_SECONDS),
-        episodes_per_second=_episodes_per_second(present, lambda host_stats: host_stats.job_seconds),
-        evaluation_episodes_per_second=_episodes_per_second(present, lambda host_stats: host_stats.evaluation_seconds),
+        episodes_per_second=_episodes_per_second(present, lambda host_stats: host_stats.scoring.mean),
+        evaluation_episodes_per_second=_episodes_per_second(present, lambda host_stats: host_stats.evaluation.mean),
     )
 
 
@@ -248,7 +248,7 @@ def _worker(member: Member, now: float) -> WorkerStatus:
         drawn_by=member.drawn_by,
         heard=round(now - member.last_heard, 1),
         fingerprint=member.fingerprint,
-        job_seconds=_rounded(member.host_stats.job_seconds),
+        job_seconds=_rounded(member.host_stats.scoring.mean),
         round_trip=_rounded(member.host_stats.round_trip),
         resent=member.resent,
         host_class=member.host_class,

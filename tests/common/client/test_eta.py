@@ -88,6 +88,18 @@ def test_the_time_to_go_is_of_the_open_generation_and_at_the_speed_that_remains(
     assert found == (seconds and pytest.approx(seconds))
 
 
+@pytest.mark.parametrize("speed", [1.3, 1.8, 2.5])  # 8 episodes in 4.6 s are 1.74 a second
+def test_noise_of_episodes_moves_no_estimate(speed):
+    found = estimate_eta(with_speed(status({"generations": 40}, gone=4.6), candidates=speed))
+    assert found.pace == pytest.approx(4.6)
+    assert found.seconds == pytest.approx(32 * 4.6 + 5 / speed)
+
+
+def test_the_pace_that_is_shown_is_the_one_that_remains():
+    found = estimate_eta(with_speed(status({"generations": 40}, gone=99.0), candidates=0.5))
+    assert (found.pace, found.seconds) == (16.0, pytest.approx(32 * 16.0 + 10.0))
+
+
 def test_steps_are_estimated_from_the_rate_of_closed_generations():
     eta = estimate_eta(status({"steps": 576_000}, paces=(10.0, 10.0)))  # each of 64,000 steps
     assert eta.description.startswith("448k of 576k steps")

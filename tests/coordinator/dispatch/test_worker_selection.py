@@ -75,6 +75,18 @@ def test_between_two_numbers_one_slot_alone_would_not_need_more(host):
     assert times[1] <= 2 * times[0]
 
 
+def test_one_long_episode_hardly_changes_what_a_job_takes_and_a_slower_host_soon_does():
+    host = HostStats()
+    for seconds in [0.5, 1.5] * 50:
+        host.record_duration("evaluate", seconds)
+    assert host.evaluation.mean == pytest.approx(1.0, rel=0.05)
+    host.record_duration("evaluate", 10.0)
+    assert host.evaluation.mean < 1.2
+    for _ in range(200):
+        host.record_duration("evaluate", 3.0)
+    assert host.evaluation.mean == pytest.approx(3.0, rel=0.1)
+
+
 def test_beyond_what_was_measured():
     assert HostStats().expected_seconds(1) == math.inf
     host = measured(jobs8=2.0)
