@@ -6,7 +6,7 @@ is therefore common to both scores and cancels in a difference per track (`commo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -99,6 +99,7 @@ class EqualBudget:
     evaluated_means: tuple[EvaluatedMean | None, ...]
 
 
+STATISTICS = "task.options.normal."  # mean and deviation of observations, as a run began
 STEPS, CORE_HOURS = "steps in reality", "core-hours"
 BUDGETS: dict[str, Callable[[Effort], float]] = {
     STEPS: lambda effort: effort.steps,
@@ -108,10 +109,19 @@ BUDGETS: dict[str, Callable[[Effort], float]] = {
 
 def differing_settings(sides: Sequence[ComparedRun]) -> dict[str, list[Any]]:
     """The settings that differ, each with one value a run; `None` is the default."""
-    flat = [_flatten(expand_task_options(to_plain(each.settings))) for each in sides]
+    return differing_values([to_plain(each.settings) for each in sides])
+
+
+def differing_values(sides: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """What differs between plain settings, by dotted name; of --normalise not the statistics that each side has."""
+    flat = [_flatten(expand_task_options(each)) for each in sides]
     names = sorted({name for each in flat for name in each})
     rows = {name: [each.get(name) for each in flat] for name in names}
-    return {name: values for name, values in rows.items() if any(value != values[0] for value in values)}
+    return {
+        name: values
+        for name, values in rows.items()
+        if any(value != values[0] for value in values) and not (name.startswith(STATISTICS) and None not in values)
+    }
 
 
 def are_comparable(sides: Sequence[ComparedRun]) -> bool:

@@ -28,7 +28,6 @@ PLOT_COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", 
 PLAIN = "{x:,.10g}"  # of the numbers of an axis: whole ones, without an offset beside them
 FEW_EPISODES = 4  # of a candidate, up to which luck with a generation's seeds is visible in its mean
 WINDOW = 9  # generations of a running median; a run of twice as many has one
-ASIDE = 0.012  # of the x axis: how far a confirmed score stands beside the same mean's evaluation
 
 
 def has_score_panel(run: RunFolder) -> bool:
@@ -151,7 +150,6 @@ def _draw_evaluations(axes: Any, run: RunFolder, jumps: Sequence[int]) -> None:
     if confirmed is not None:
         score = format_with_error(confirmed.mean, confirmed.error)
         axes.errorbar(
-            confirmed.generation + ASIDE * max(1, len(run.history()) - 1), confirmed.mean, error_bars([confirmed]),
-            fmt="*", color="tab:red", **STAR,
+            confirmed.generation, confirmed.mean, error_bars([confirmed]), fmt="*", color="tab:red", **STAR,
             label=f"reported: {score} on {plural(confirmed.episodes, f'fresh {word}')}",
         )  # fmt: skip

@@ -18,6 +18,7 @@ from dreamfleet.common.addons.analysis.comparison import (
     budget_name,
     difference,
     differing_settings,
+    differing_values,
     paired_scores,
 )
 from dreamfleet.common.cli.global_config import add_global_flags
@@ -105,11 +106,9 @@ def _compare_reports(args: argparse.Namespace, paths: Sequence[Path]) -> int:
     (first, base), *others = [(path, read_evaluation_report(path)) for path in paths]
     lines, rows = [_line(first, base)], []
     for path, each in others:
-        differing = [what for what in OTHER_CAUSES if getattr(base, what) != getattr(each, what)]
-        for what in differing:
-            one, other = getattr(base, what), getattr(each, what)
-            note = f"note: {first} and {path} are of different {OTHER_CAUSES[what]}: {one!r} and {other!r}"
-            print(note, file=sys.stderr)
+        causes = _other_causes(base, each)
+        for what, values in causes.items():
+            print(f"note: {first} and {path} are of different {OTHER_CAUSES[what]}: {values}", file=sys.stderr)
         figures: dict[str, Any] = {}
         if base.world != each.world:
             text = "scores of different worlds are not compared"
@@ -120,9 +119,30 @@ def _compare_reports(args: argparse.Namespace, paths: Sequence[Path]) -> int:
             text = found.describe(minimised=base.results.minimised)
             figures = {**asdict(found), "clear": found.is_significant}
         lines += [_line(path, each), f"{path} less {first}: {text}"]
-        rows.append({"report": path, "against": first, **figures, "differing_facts": differing})
+        rows.append({"report": path, "against": first, **figures, "differing_facts": list(causes)})
     print_answer(args, "\n".join(lines), differences=rows)
     return 0
+
+
+def _other_causes(base: EvaluationReport, other: EvaluationReport) -> dict[str, str]:
+    """The fields of two reports that may cause a difference besides the controllers, and their values as a text."""
+    found = {}
+    for what in OTHER_CAUSES:
+        one, two = getattr(base, what), getattr(other, what)
+        if what == "options":
+            rows = differing_values([{"task": {"options": each}} for each in (one, two)])
+            if rows:
+                found[what] = ", ".join(
+                    f"{name.removeprefix('task.options.')} {_shown(values[0])} and {_shown(values[1])}"
+                    for name, values in rows.items()
+                )
+        elif one != two:
+            found[what] = f"{one!r} and {two!r}"
+    return found
+
+
+def _shown(value: object) -> str:
+    return "default" if value is None else format_setting(value)
 
 
 def _line(path: Path, found: EvaluationReport) -> str:
@@ -152,8 +172,7 @@ def _compare_runs(args: argparse.Namespace, names: Sequence[str]) -> int:
     print_rows([_run_row(each) for each in shown], drop_order=("task", "spent"))
     print()
     if settings:
-        rows = [[name, *("default" if value is None else format_setting(value) for value in values)]
-                for name, values in settings.items()]  # fmt: skip
+        rows = [[name, *map(_shown, values)] for name, values in settings.items()]
         print_rows([dict(zip(("setting", *(each.name for each in sides)), row, strict=True)) for row in rows])
         print()
     else:

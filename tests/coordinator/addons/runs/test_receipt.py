@@ -23,6 +23,7 @@ from dreamfleet.common.addons.analysis.comparison import (
     are_comparable,
     at_equal_budget,
     differing_settings,
+    differing_values,
 )
 from dreamfleet.common.addons.analysis.fitness_chart import WINDOW, running_median
 from dreamfleet.common.addons.analysis.learning import LearningCurve, Point
@@ -489,7 +490,7 @@ def test_nothing_is_cut_and_ticks_are_generations(runs, name, last):
     assert all(float(each).is_integer() for each in panel.get_xticks())
     if last is not None:
         star = star_of(panel)
-        assert last < star.get_xdata()[0] < panel.get_xlim()[1]  # beside its evaluation, within the panel
+        assert last == star.get_xdata()[0] < panel.get_xlim()[1]
         assert star.get_zorder() > max(each.get_zorder() for each in panel.lines if each is not star)
         assert any("-30.0 ± 4.5" in each.get_text() for each in figure.legends[0].get_texts())
 
@@ -570,6 +571,17 @@ def test_settings_that_differ_are_named_and_others_are_not(runs):
     assert found["task.task"] == ["dream", "car-racing"]
     assert "sigma0" not in found
     assert differing_settings([dream, dream]) == {}
+
+
+def test_what_two_runs_measured_of_their_observations_is_no_setting_that_differs():
+    one, other, plain = (
+        {"task": {"options": json.dumps(each)}}
+        for each in (
+            {"normal": {"mean": [0.1], "deviation": [1.0]}}, {"normal": {"mean": [0.2], "deviation": [2.0]}}, {},
+        )
+    )  # fmt: skip
+    assert differing_values([one, other]) == {}
+    assert differing_values([one, plain])["task.options.normal.mean"] == [[0.1], None]
 
 
 def test_at_an_equal_budget_no_evaluated_mean_exceeds_it(runs):
