@@ -11,6 +11,7 @@ from contextlib import ExitStack
 
 import pytest
 
+from dreamfleet.common.printable import format_number
 from tests.support import tasks
 from tests.support.browser import dashboard, tab, wait_until
 from tests.support.browser import wait_for_text as wait
@@ -67,6 +68,7 @@ def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes,
     assert page.locator("[data-part=cells] .cell").count() == 4
     assert "of 1,000 generations" in part(page, "eta")
     assert "alpha" in part(page, "workers")
+    assert not page.locator(".workers [data-label=picture]").first.is_visible()  # this task says nothing of pictures
     row = ".workers tr[data-state=present] td:has-text('alpha')"
     page.wait_for_selector(row, state="attached")
     began = time.monotonic()
@@ -84,6 +86,19 @@ def test_it_follows_a_run_from_nobody_through_losses_to_its_end(page, processes,
     assert "4 generations" in part(page, "sentence")
     drawn(page, "Generation 3:")
     without_absence(page)
+
+
+SCORES = """async numbers => {
+    const {score} = await import(document.querySelector("script[type=module]").src.replace("main.js", "dom.js"));
+    return numbers.map(score);
+}"""
+
+
+@pytest.mark.slow
+def test_tiny_and_huge_scores_are_short_as_elsewhere(page):
+    numbers = [1.837e-24, -4.127e-05, 3e15, 0.0123, 0, 875.62]
+    assert page.evaluate(SCORES, numbers) == ["1.837e-24", "-4.127e-05", "3e+15", "0.0123", "0.0", "875.6"]
+    assert [format_number(each) for each in numbers[:3]] == page.evaluate(SCORES, numbers[:3])
 
 
 @pytest.mark.slow

@@ -61,9 +61,13 @@ export const number = (value, digits = 1) =>
     ? "-"
     : value.toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits });
 
-// A score: with one decimal, so that a column of them is aligned, or in three significant digits if it is small.
-export const score = (value) =>
-  !value || Math.abs(value) >= 0.95 ? number(value) : value.toLocaleString("en", { minimumSignificantDigits: 3, maximumSignificantDigits: 3 });
+// A score: with one decimal, so that a column of them is aligned, or in three significant digits if it is small. One that
+// is tiny or huge has an exponent, as in `format_number`.
+export const score = (value) => {
+  const size = Math.abs(value ?? 0);
+  if (size && (size < 1e-4 || size >= 1e12)) return String(Number(value.toPrecision(4)).toExponential()).replace(/e([+-])(\d)$/, "e$10$2");
+  return !size || size >= 0.95 ? number(value) : value.toLocaleString("en", { minimumSignificantDigits: 3, maximumSignificantDigits: 3 });
+};
 
 export const short = (seconds) => (seconds < 10 ? seconds.toPrecision(2) : number(seconds, 0));
 

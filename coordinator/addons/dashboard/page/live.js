@@ -196,6 +196,7 @@ const fillWorkers = (frame) => {
     sight.unobserve(fleet.lastElementChild);
     fleet.lastElementChild.remove();
   }
+  fleet.parentElement.classList.toggle("undrawn", workers.picture.every((each) => each === "-"));
   const all = count < MANY || turns % 5 === 0;
   turns += 1;
   let before = "";

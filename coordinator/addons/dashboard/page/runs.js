@@ -109,6 +109,7 @@ const describe = (each, key) => {
 
 // As many decimals as show the first figure of a small error.
 const withError = (mean, error) => {
+  if ((error > 0 && error < 1e-6) || Math.abs(mean) >= 1e12) return `${score(mean)} ± ${score(error)}`;
   const digits = error > 0 && error < 0.1 ? Math.min(6, -Math.floor(Math.log10(error))) : 1;
   return `${number(mean, digits)} ± ${number(error, digits)}`;
 };

@@ -38,8 +38,8 @@ export const show = (parts) => {
     settle();
   });
   page["view-again"].addEventListener("click", restart);
-  inSight = new IntersectionObserver(([each]) => {
-    seen = each.isIntersecting;
+  inSight = new IntersectionObserver((changes) => {
+    seen = changes.at(-1).isIntersecting; // a busy page hears of several at once
     settle();
   });
   inSight.observe(page.view);
