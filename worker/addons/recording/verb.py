@@ -92,6 +92,7 @@ def _record_videos(args: argparse.Namespace, agent: Agent, record_here: Recorder
     word, most = world.score_word, min(args.steps, world.horizon)
     with stop_on_signals() as stop:
         for seed, video in video_paths(args, first_seed(known)).items():
+            replaces = video.exists()
             with progress_bar("record", most, "steps") as bar:
                 score, driven = record_in_process(record_here, seed, video, bar.update, stop)
                 bar.end(driven, "" if driven == most else "the episode ended")
@@ -103,5 +104,6 @@ def _record_videos(args: argparse.Namespace, agent: Agent, record_here: Recorder
             beside = "" if known is None else known.describe_beside(seed, word)
             if driven == most < min(world.horizon, MOST_STEPS):  # scores of whole episodes are no measure for it
                 beside = f" in its first {plural(driven, 'step')} (--steps)"
-            text = f"{video}: {profile.format_score(score)} on {word} {seed}{beside}"
-            print_answer(args, text, video=video, score=score, seed=seed)
+            where = f"{video} (in place of an earlier one)" if replaces else f"{video}"
+            text = f"{where}: {profile.format_score(score)} on {word} {seed}{beside}"
+            print_answer(args, text, video=video, score=score, seed=seed, replaced=replaces)
