@@ -106,6 +106,12 @@ def begin_again(folder):
         journal.commit()
 
 
+def forget_old_events(folder):
+    """What a coordinator does whose run has many."""
+    begin_again(folder)
+    change_journal(folder, "DELETE FROM event WHERE number < (SELECT max(number) FROM event)")
+
+
 ADDED = {
     "event": "1, 0.0, 1, 'incarnation 1 begins', '', ''",
     "result": "randomblob(32), kind, generation, candidate, episode, seed, fitness, steps, seconds, worker, "
@@ -134,7 +140,7 @@ def test_a_copy_that_holds_what_its_run_does_not_is_kept(finished, safe, ahead):
     assert (copy / JOURNAL).read_bytes() == kept
 
 
-@pytest.mark.parametrize("change", [begin_again, partial(bar_stored, host="vm", is_barred=True)])
+@pytest.mark.parametrize("change", [begin_again, forget_old_events, partial(bar_stored, host="vm", is_barred=True)])
 def test_a_copy_that_is_behind_is_replaced_and_then_is_no_copy_to_go_back_from(finished, safe, change):
     source, copy = finished.runs / "test", safe / "test"
     change(source)

@@ -21,12 +21,13 @@ from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, ROLLOUTS, run_command
 from dreamfleet.coordinator.storage.journal_file import copy_database, sqlite_side_files
 
-# What an earlier copy has and a new one lacks. A run only ever adds events, but for the oldest ones, results, which a
-# recall sets aside, and batches. An event has its time: copies that were both continued share no later one.
+# What an earlier copy has and a new one lacks. A run only ever adds events, of which it forgets the oldest, results,
+# which a recall sets aside, and batches. An event has its time: copies that were both continued share no later one.
 _EVENT = "SELECT number, happened, incarnation, text, what, worker FROM"
 _KEY = "kind, generation, candidate, episode, digest"  # by which nearly all are found; one may count elsewhere now
 LOST = (
-    f"SELECT * FROM ({_EVENT} earlier.event ORDER BY number DESC LIMIT 1) EXCEPT {_EVENT} main.event",  # noqa: S608
+    f"SELECT * FROM ({_EVENT} earlier.event ORDER BY number DESC LIMIT 1) "  # noqa: S608
+    f"WHERE number >= (SELECT coalesce(min(number), 0) FROM main.event) EXCEPT {_EVENT} main.event",
     f"WITH own AS (SELECT {_KEY} FROM earlier.result UNION ALL SELECT {_KEY} FROM earlier.recalled) "  # noqa: S608
     f"SELECT digest FROM own WHERE ({_KEY}) NOT IN (SELECT {_KEY} FROM main.result) "
     "AND digest NOT IN (SELECT digest FROM main.recalled) EXCEPT SELECT digest FROM main.result",
