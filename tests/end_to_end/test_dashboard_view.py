@@ -8,6 +8,8 @@ from tests.support.browser import dashboard, tab, wait_for_text, wait_until
 
 PICTURE = "[data-part=view-picture]:not([hidden])"
 OTHER = "src => document.querySelector('[data-part=view-picture]').src !== src"
+LATER = "before => [...document.querySelectorAll('[data-part=view-facts] div')].some(each => " \
+        "each.textContent.startsWith('generation') && Number(each.lastChild.textContent) > Number(before))"  # fmt: skip
 WHOM = "[data-part=view-whom]"
 HIDE = "hidden => { Object.defineProperty(document, 'hidden', {value: hidden, configurable: true}); " \
        "document.dispatchEvent(new Event('visibilitychange')) }"  # fmt: skip
@@ -89,6 +91,11 @@ def test_a_task_without_pictures_takes_no_room_for_them(browser, processes, smal
         page.wait_for_selector("[data-part=view]:not([hidden])").scroll_into_view_if_needed()
         say(page, "Workers score this task without drawing it; `dreamfleet record` and `live` draw it.")
         assert facts(page)["worker"].startswith("alpha/")
+        shown = facts(page)
+        page.evaluate(HIDE, True)
+        assert facts(page) == {}
+        page.evaluate(HIDE, False)
+        wait_until(page, LATER, shown["generation"])
         assert page.locator("[data-part=view]").bounding_box()["height"] < 300
 
 

@@ -118,6 +118,7 @@ export const settle = () => {
   if (!page) return;
   say(page["view-pause"], paused ? "Play" : "Pause");
   const wanted = run && seen && !paused && !over && !document.hidden;
+  if (!wanted && source && !paused && page["view-picture"].hidden) facts(page["view-facts"], []); // else they would pass for news
   if (!wanted) close();
   if (paused && !over) showText(page["view-picture"].hidden ? "Paused: nothing is drawn or sent." : "");
   if (!wanted || source) return;
