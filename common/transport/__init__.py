@@ -3,4 +3,4 @@
 Its pages: docs/how-to/router.md, docs/reference/protocol.md, docs/explanation/threats.md.
 """
 
-__all__ = ["session", "query", "network"]
+__all__ = ["session", "link_check", "query", "network"]

@@ -24,16 +24,19 @@ class NameLock:
     """Holds the name and watches other coordinators' tokens; closing `stack` releases the name and ends the watch."""
 
     def __init__(self, session: zenoh.Session, run: str, nonce: str, stack: ExitStack) -> None:
-        self._session = session
         self._run = run
         self._nonce = nonce
-        self._leader_check = LeaderCheck(nonce, TOKEN_TIMEOUT)
-        self._inbox: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._stack = stack
+        self._watch(session)
+
+    def _watch(self, session: zenoh.Session, own_note: ClaimNote | None = None) -> None:
+        self._session = session
+        self._leader_check = LeaderCheck(self._nonce, TOKEN_TIMEOUT, own_note)
+        self._inbox: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         watcher = session.liveliness().declare_subscriber(
-            keys.live_coordinator(run, "*"), enqueue_into(self._inbox, "token"), history=True
+            keys.live_coordinator(self._run, "*"), enqueue_into(self._inbox, "token"), history=True
         )
-        stack.callback(watcher.undeclare)
+        self._stack.callback(watcher.undeclare)
 
     def acquire(self, *, linked: bool) -> None:
         """Take the name; `RefusedError` if a live coordinator has it: a newcomer has nothing to lose.
@@ -45,20 +48,33 @@ class NameLock:
             self._listen(now, DISCOVERY_SECONDS / 10)
             if self._leader_check.live(now):
                 raise RefusedError(f"run {self._run} has a live coordinator already: stop it, or choose another --run")
+        self._show_token()
+
+    def move(self, session: zenoh.Session) -> None:
+        """Hold the name on another session, as after a link that returned; the old one's stack is closed by then."""
+        self._watch(session, self._leader_check.own_note)
+        self._show_token()
+        self._answer_claims()
+
+    def _show_token(self) -> None:
         token = self._session.liveliness().declare_token(keys.live_coordinator(self._run, self._nonce))
         self._stack.callback(token.undeclare)
 
     def announce(self, run_uid: str, incarnation: int) -> None:
         """Identify this coordinator from now on, to every other one that asks."""
         note = ClaimNote(run_uid=run_uid, incarnation=incarnation, nonce=self._nonce, began=time())
-        self._leader_check.own_note, payload = note, encode_json(note)
-        key = keys.claim(self._run, self._nonce)
+        self._leader_check.own_note = note
+        self._answer_claims()
+
+    def _answer_claims(self) -> None:
+        key, payload = keys.claim(self._run, self._nonce), encode_json(self._leader_check.own_note)
+        inbox = self._inbox
 
         def answer(query: zenoh.Query) -> None:
             """Answer in Zenoh's thread: the service's loop may be busy."""
             with query:
                 if query.payload is not None:  # the asking coordinator identifies itself
-                    self._inbox.put(("note", query.payload.to_bytes()))
+                    inbox.put(("note", query.payload.to_bytes()))
                 query.reply(key, payload, encoding="application/json")
 
         queryable = self._session.declare_queryable(key, zenoh.handlers.Callback(answer, indirect=False))

@@ -8,7 +8,7 @@ import queue
 import secrets
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import monotonic
 from typing import Any
 
@@ -32,6 +32,7 @@ from dreamfleet.common.runs.records import StoredGeneration
 from dreamfleet.common.schema.validation import MalformedError
 from dreamfleet.common.security.certificate_ledger import RevocationWatcher
 from dreamfleet.common.security.credentials import worker_seat_identity
+from dreamfleet.common.transport.link_check import LinkCheck
 from dreamfleet.common.transport.session import Network, open_session
 from dreamfleet.coordinator.dispatch.packing import SentBatch
 from dreamfleet.coordinator.dispatch.refusals import Refusal
@@ -86,6 +87,7 @@ class Service:
         self._metrics_port = metrics_port
         self._intervals = intervals
         self._nonce = secrets.token_hex(8)
+        self._link_check = LinkCheck(network, log)
         self._events = InboundQueue()
         self._inbox = CountingDecoder()
         self._error_counter = ErrorCounter(log)
@@ -101,17 +103,21 @@ class Service:
 
     def serve(self, open_run: Callable[[], OpenRun]) -> Run:
         """Claim all addresses and the name on the network, then open the run and serve it; the run as it was left."""
-        with ExitStack() as last, open_session(self._network) as session, ExitStack() as stack:
+        with ExitStack() as last, ExitStack() as stack:
+            session = stack.enter_context(open_session(self._network))
             self._name_lock = NameLock(session, self._name, self._nonce, stack)
             self._name_lock.acquire(linked=bool(self._network.connect))
             if self._metrics_port:
                 serve_metrics = add_on("serve-metrics")
                 last.enter_context(serve_metrics(self._metrics_port, lambda: self._snapshot, lambda: self._stopping))
-            declared = self._start(session, open_run())
+            self._start(open_run())
+            self._declared = self._declare(session)
+            self._run_log.begin()
             try:
-                self._loop(session)
+                while self._loop(session):
+                    session = self._open_again(session, stack)
                 if not self._run.state.is_rewound:
-                    self._shut_down(session, declared)
+                    self._shut_down(session)
             except JournalError:
                 self._file_watch.check(monotonic(), at_once=True)  # what was done to the files may be rescued
                 raise
@@ -125,10 +131,26 @@ class Service:
                 ) from error
         return self._run
 
-    def _start(self, session: zenoh.Session, opened: OpenRun) -> list[Any]:
-        """Answer for the run from now on; what is declared on the session."""
-        self._run, self._file_watch, name = opened.run, opened.file_watch, self._name
-        run = opened.run
+    def _open_again(self, session: zenoh.Session, stack: ExitStack) -> zenoh.Session:
+        """Serve the run on a session with another id, or go on with this one if no router answers after all."""
+        if self._network.listen:
+            stack.close()  # the port is needed
+            network = replace(self._network, revoked_seats=self._revocations.revoked_seats)
+            fresh = open_session(network, timeout=None)
+        else:
+            try:
+                fresh = open_session(self._network)
+            except DreamfleetError:
+                return session
+            stack.close()
+        stack.enter_context(fresh)
+        self._name_lock.move(fresh)
+        self._declared = self._declare(fresh)
+        return fresh
+
+    def _start(self, opened: OpenRun) -> None:
+        self._run, self._file_watch, self._bundle = opened.run, opened.file_watch, opened.bundle
+        run, name = opened.run, self._name
         self._name_lock.announce(run.uid, run.incarnation)
         self._protocol = WorkerProtocol(run, name, self._nonce, self._intervals)
         self._control = Control(run, name, self._intervals.beat, self.stop)
@@ -138,6 +160,10 @@ class Service:
         self._started = monotonic()
         self._run_log = RunLog(run, name, self._network, self._started)
         self._snapshot = self._take_snapshot()
+
+    def _declare(self, session: zenoh.Session) -> list[Any]:
+        """Answer for the run from now on; what is declared on the session."""
+        run, name = self._run, self._name
         subscribe, answer = session.declare_subscriber, session.declare_queryable
         declared = [
             *(subscribe(keys.all_workers(kind, name), self._enqueue(kind)) for kind in _WORKER_MESSAGES),
@@ -149,15 +175,14 @@ class Service:
             answer(keys.batch(name, "*"), self._enqueue("batch")),
             *declare_status(session, name, lambda: self._snapshot, self._error_counter),
         ]
-        if opened.bundle is not None:
+        if self._bundle is not None:
             sha256 = run.settings.task.bundle
             head = {"run_uid": run.uid, "incarnation": run.incarnation, "sha256": bytes.fromhex(sha256)}
             key = keys.bundle(name, sha256)
-            declared.append(declare_bundle(session, key, opened.bundle, head, self._error_counter))
-        self._run_log.begin()
+            declared.append(declare_bundle(session, key, self._bundle, head, self._error_counter))
         return declared
 
-    def _loop(self, session: zenoh.Session) -> None:
+    def _loop(self, session: zenoh.Session) -> bool:
         snapshot_at, published = monotonic(), len(self._run.history)
         while not (self._stopping or isinstance(self._run.state, Ended)):
             self._drain_events()
@@ -190,8 +215,11 @@ class Service:
             self._file_watch.check(now)
             self._name_lock.check(now)
             self._check_revocations(now)
+            if self._link_check.find_apart(session, now):
+                return True
+        return False
 
-    def _shut_down(self, session: zenoh.Session, declared: list[Any]) -> None:
+    def _shut_down(self, session: zenoh.Session) -> None:
         """Make the run durable, stop answering, and publish the last status."""
         self._file_watch.check(monotonic(), at_once=True)
         self._run.leave()
@@ -199,7 +227,7 @@ class Service:
         self._snapshot = self._take_snapshot().as_left()
         if self._run.state.ended is not None:
             self._dismiss_workers(session)
-        for each in declared:
+        for each in self._declared:
             each.undeclare()
         session.put(keys.event_status(self._name), encode_status(self._snapshot), encoding="application/json")
 

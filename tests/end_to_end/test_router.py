@@ -11,6 +11,7 @@ import zenoh
 
 from dreamfleet.common.addons.router import verb
 from dreamfleet.common.security.certificate_ledger import RevocationWatcher
+from dreamfleet.common.transport import link_check
 from dreamfleet.common.transport.network import Network
 from dreamfleet.common.transport.session import open_session, zenoh_config
 from tests.support import tasks
@@ -120,7 +121,7 @@ def routers_of(session):
 
 @pytest.mark.slow
 def test_a_router_whose_id_another_session_has_begins_again_with_another_id(monkeypatch, tmp_path):
-    monkeypatch.setattr(verb, "LINK_TIMEOUT", 1.0)
+    monkeypatch.setattr(link_check, "LINK_TIMEOUT", 1.0)
     monkeypatch.setattr(verb, "CHECK_INTERVAL", 0.1)
     far, near = (f"tcp/127.0.0.1:{free_port()}" for _ in range(2))
     stopped = Event()

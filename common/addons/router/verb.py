@@ -22,13 +22,13 @@ from dreamfleet.common.host.standard_streams import make_stderr_nonblocking
 from dreamfleet.common.host.stop_signals import SIGNALS
 from dreamfleet.common.printable import plural
 from dreamfleet.common.security.certificate_ledger import CHECK_INTERVAL, RevocationWatcher
+from dreamfleet.common.transport.link_check import LinkCheck
 from dreamfleet.common.transport.network import DEFAULT_ENDPOINT, SECURED_ENDPOINT, Network
 from dreamfleet.common.transport.session import open_session, zenoh_config
 
 SUMMARY = "forward messages between coordinators and workers that connect here; it stores nothing and may be restarted"
 EXTRAS = ()
 SUMMARY_INTERVAL = 60.0  # seconds between two log lines about the sessions
-LINK_TIMEOUT = 10.0  # seconds without a link to another router before that is looked into
 log = logging.getLogger("dreamfleet.router")
 
 
@@ -86,22 +86,22 @@ def run(args: argparse.Namespace) -> int:
 def run_router(network: Network, stopped: Event, revocations: RevocationWatcher) -> None:
     """Route messages between all connected sessions until `stopped`; `ConnectionFailedError` if it cannot listen.
 
-    Other routers in `network.connect` may start later, stop and return. If one of them answers and is not linked for
-    `LINK_TIMEOUT`, another session there may have this one's id, so the router begins again with another id.
-    `AccessError` once its own file is revoked or expired.
+    Other routers in `network.connect` may start later, stop and return. If one of them answers and stays unlinked, the
+    router begins again with another id. `AccessError` once its own file is revoked or expired.
     """
     others = f"; linked to {', '.join(network.connect)} while it is reachable" if network.connect else ""
     log.info("listening on %s%s", ", ".join(network.listen), others,
              extra={"facts": {"event": "begin", "listen": network.listen, "connect": network.connect}})  # fmt: skip
+    link_check = LinkCheck(network, log)
     while not stopped.is_set():
+        network = replace(network, revoked_seats=revocations.revoked_seats)
         with closing(open_session(network, timeout=None)) as session:
-            _route(session, network, stopped, revocations)
+            _route(session, link_check, stopped, revocations)
 
 
-def _route(session: zenoh.Session, network: Network, stopped: Event, revocations: RevocationWatcher) -> None:
+def _route(session: zenoh.Session, link_check: LinkCheck, stopped: Event, revocations: RevocationWatcher) -> None:
     """Route until `stopped`, or until another router answers and does not link this one."""
-    summary_at = linked_at = monotonic()
-    said: set[str] = set()  # of which addresses do not answer
+    summary_at = monotonic()
     while not stopped.wait(CHECK_INTERVAL):
         now = monotonic()
         revocations.reload_if_changed(now)
@@ -109,40 +109,9 @@ def _route(session: zenoh.Session, network: Network, stopped: Event, revocations
         if now - summary_at >= SUMMARY_INTERVAL:
             summary_at = now
             _log_sessions(session)
-        if _count_linked(session, network.connect) == len(network.connect):
-            linked_at, said = now, set()
-        elif now - linked_at >= LINK_TIMEOUT:
-            linked_at = now
-            apart, silent = _find_unlinked(session, network)
-            for each in silent - said:
-                log.warning("not linked to %s: it does not answer", each, extra={"facts": {"event": "unlinked"}})
-            said |= silent
-            if apart:
-                text = "%s answers, but not this router, whose id another session may have: it begins again"
-                log.warning(text, ", ".join(apart), extra={"facts": {"event": "apart", "connect": apart}})
-                return
+        if link_check.find_apart(session, now):
+            return
     _log_sessions(session)
-
-
-def _count_linked(session: zenoh.Session, connect: tuple[str, ...]) -> int:
-    """How many of these addresses this router is linked to."""
-    ports = {each.rpartition(":")[2] for each in connect}
-    routers = {str(each.zid) for each in session.info.transports() if str(each.whatami) == "router"}
-    ends = {each.dst for each in session.info.links() if str(each.zid) in routers}
-    return min(sum(each.rpartition(":")[2] in ports for each in ends), len(connect))
-
-
-def _find_unlinked(session: zenoh.Session, network: Network) -> tuple[list[str], set[str]]:
-    """The other routers that answer a client although they are not linked, and those that do not answer."""
-    linked, apart, silent = set(map(str, session.info.routers_zid())), list[str](), set[str]()
-    for each in network.connect:
-        try:
-            with closing(open_session(replace(network, listen=(), connect=(each,)))) as client:
-                if linked.isdisjoint(map(str, client.info.routers_zid())):
-                    apart.append(each)
-        except DreamfleetError:
-            silent.add(each)
-    return apart, silent
 
 
 def _log_sessions(session: zenoh.Session) -> None:
