@@ -15,6 +15,7 @@ LOOPBACK = "127.0.0.1"
 SECURED_PREFIX = "tls/"  # prefix of a secured fleet's endpoints
 SECURED_ENDPOINT = "tls/0.0.0.0:7447"  # default of a secured coordinator
 LOOK_INTERVAL = 0.02  # seconds between two looks whether a process of this host listens
+_LOOPBACK_HEADER = re.compile(r"(localhost|127\.\d+\.\d+\.\d+|\[::1\])(:\d+)?", re.IGNORECASE)
 _ENDPOINT = re.compile(r"(tcp|tls|udp|quic)/(\[[0-9a-fA-F:]+(?:%[\w.-]+)?\]|[^:/\s%]+):(\d{1,5})")
 
 
@@ -92,6 +93,11 @@ def is_loopback_host(host: str) -> bool:
         return ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
+
+
+def names_loopback(host_header: str) -> bool:
+    """Whether a request's `Host` header names the loopback: another site's name may resolve to it (DNS rebinding)."""
+    return bool(_LOOPBACK_HEADER.fullmatch(host_header))
 
 
 def check_endpoint(endpoint: str) -> str:

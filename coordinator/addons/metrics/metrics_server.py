@@ -5,14 +5,16 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, HTTPServer
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from time import monotonic, sleep
+from typing import Any, cast
 
 from dreamfleet.common.errors import ConnectionFailedError
-from dreamfleet.common.transport.network import parse_metrics_address
+from dreamfleet.common.transport.network import is_loopback_host, names_loopback, parse_metrics_address
 from dreamfleet.coordinator.service.snapshot import Snapshot
 
-TIMEOUT = 5.0  # seconds for a request and its response: the server handles one client at a time
+TIMEOUT = 5.0  # seconds for a request and its response
+MOST_CLIENTS = 64  # at a time, each in a thread; beyond them a connection is closed at once
 POLL = 0.1  # seconds
 LONGEST = 90.0  # seconds that an ended run waits for its scraper to see that it ended
 
@@ -62,10 +64,26 @@ class ScrapeTimes:
         return self._state != "ended" and now - since < min(2 * self._interval, LONGEST)
 
 
-class _MetricsServer(HTTPServer):
+class _MetricsServer(ThreadingHTTPServer):
     def __init__(self, address: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
         super().__init__(address, handler)
         self.scrapes = ScrapeTimes()
+        self.is_loopback = is_loopback_host(address[0])
+        self._room = threading.Semaphore(MOST_CLIENTS)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Handle a connection in a thread, while there are few."""
+        if self._room.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Handle a connection, then make room for another."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._room.release()
 
     def handle_error(self, *_: object) -> None:
         """Log nothing when a client disconnects or sends nothing."""
@@ -80,7 +98,7 @@ def _handler(snapshot: Callable[[], Snapshot]) -> type[BaseHTTPRequestHandler]:
         sys_version = ""
 
         def handle(self) -> None:
-            """Handle one request; a slow client is cut off, for it would block others and the coordinator's exit."""
+            """Handle one request; a slow client is cut off, for its thread keeps others out."""
             late = threading.Timer(TIMEOUT, self._drop)
             late.daemon = True
             late.start()
@@ -94,6 +112,10 @@ def _handler(snapshot: Callable[[], Snapshot]) -> type[BaseHTTPRequestHandler]:
                 self.connection.shutdown(socket.SHUT_RDWR)
 
         def do_GET(self) -> None:  # http.server requires this name
+            server = cast(_MetricsServer, self.server)
+            if server.is_loopback and not names_loopback(self.headers.get("Host", "")):
+                self.send_error(HTTPStatus.MISDIRECTED_REQUEST, "ask for this address as http://127.0.0.1")
+                return
             if self.path.partition("?")[0] != "/metrics":
                 self.send_error(HTTPStatus.NOT_FOUND, "there is only /metrics")
                 return
@@ -104,8 +126,7 @@ def _handler(snapshot: Callable[[], Snapshot]) -> type[BaseHTTPRequestHandler]:
             self.send_header("Content-Length", str(len(body)))
             self.end_headers()
             self.wfile.write(body)
-            if isinstance(self.server, _MetricsServer):
-                self.server.scrapes.record(status.state, monotonic())
+            server.scrapes.record(status.state, monotonic())
 
         def log_message(self, *_: object) -> None:
             """Log no scrape."""

@@ -2,7 +2,6 @@
 
 import hashlib
 import hmac
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
@@ -11,7 +10,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-_OWN_HOST = re.compile(r"(localhost|127\.\d+\.\d+\.\d+|\[::1\])(:\d+)?", re.IGNORECASE)
+from dreamfleet.common.transport.network import names_loopback
 
 
 class Guard(ABC):
@@ -41,8 +40,7 @@ class Guard(ABC):
         await (self._refusal(scope, Headers(scope=scope)) or self._app)(scope, receive, with_headers)
 
     def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
-        if self._is_loopback and not _OWN_HOST.fullmatch(headers.get("host", "")):
-            # Otherwise a page whose host name resolves to this address could use ours (DNS rebinding).
+        if self._is_loopback and not names_loopback(headers.get("host", "")):
             return self.refuse(421, "misdirected", "ask for this address as http://127.0.0.1, with its port")
         # Browsers send Sec-Fetch headers (https://www.w3.org/TR/fetch-metadata/); other clients send none.
         if headers.get("sec-fetch-site", "none") not in ("same-origin", "none") and not self.is_link(scope, headers):

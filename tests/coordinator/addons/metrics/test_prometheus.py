@@ -3,9 +3,12 @@ Tests metrics_server.py."""
 
 import json
 import re
+import select
 import socket
 import threading
+import urllib.error
 import urllib.request
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 
 import pytest
@@ -17,7 +20,7 @@ from dreamfleet.common.runs.records import StoredConfirmation, StoredEvaluation
 from dreamfleet.coordinator.addons.metrics import metrics_server
 from dreamfleet.coordinator.addons.metrics.metrics_server import LONGEST, ScrapeTimes
 from dreamfleet.coordinator.addons.metrics.prometheus import MAX_REASONS, MAX_WORKERS, exposition
-from tests.support.processes import DEADLINE, ROOT, free_port
+from tests.support.processes import DEADLINE, ROOT, free_port, until
 from tests.support.samples import STATUS
 from tests.support.served import snapshot
 
@@ -133,6 +136,58 @@ def test_a_client_that_sends_a_byte_at_a_time_delays_neither_others_nor_the_end(
     assert dropped.wait(DEADLINE)
     over.set()
     thread.join()
+
+
+def connect(port):
+    return socket.create_connection(("127.0.0.1", port), timeout=DEADLINE)
+
+
+def scrapes(port):
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=DEADLINE) as answer:
+            return b"dreamfleet_generation" in answer.read()
+    except OSError:
+        return False
+
+
+def test_idle_connections_delay_no_scrape_until_there_are_too_many(monkeypatch):
+    monkeypatch.setattr(metrics_server, "TIMEOUT", 2 * DEADLINE)
+    monkeypatch.setattr(metrics_server, "MOST_CLIENTS", 12)
+    port = free_port()
+    with ExitStack() as stack, metrics_server.serve_metrics(str(port), snapshot, lambda: True):
+        idle = [stack.enter_context(connect(port)) for _ in range(11)]
+        for _ in range(2):  # whoever is served makes room
+            until(lambda: scrapes(port), "a scrape")
+        idle += [stack.enter_context(connect(port)) for _ in range(12)]
+        assert select.select(idle, [], [], DEADLINE)[0], "those for whom there is no room are closed at once"
+        for each in idle:
+            with suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "10.0.0.1:9108", ""])
+def test_a_page_whose_name_resolves_to_the_loopback_reads_no_metrics(host):
+    port = free_port()
+    request = urllib.request.Request(f"http://127.0.0.1:{port}/metrics", headers={"Host": host})
+    with metrics_server.serve_metrics(str(port), snapshot, lambda: True):
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            urllib.request.urlopen(request, timeout=DEADLINE)
+        refused.value.close()
+        assert refused.value.code == 421
+        for own in (f"localhost:{port}", "127.0.0.1"):
+            request.add_header("Host", own)
+            with urllib.request.urlopen(request, timeout=DEADLINE) as answer:
+                assert answer.status == 200
+
+
+def test_other_hosts_that_may_read_metrics_name_the_server_as_they_like():
+    port = free_port()
+    request = urllib.request.Request(f"http://127.0.0.1:{port}/metrics", headers={"Host": "coordinator.example"})
+    with (
+        metrics_server.serve_metrics(f"0.0.0.0:{port}", snapshot, lambda: True),
+        urllib.request.urlopen(request, timeout=DEADLINE) as answer,
+    ):
+        assert answer.status == 200
 
 
 def test_an_ended_run_waits_until_its_scraper_has_seen_the_end():
