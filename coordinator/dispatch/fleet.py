@@ -160,7 +160,7 @@ class Fleet:
             self.event_log.add("failed" if failed else verdict, identity, result.digest)
         if member is not None:
             member.end_lease(result.digest)
-            member.verdicts.append(Verdict(result.digest, verdict))
+            member.add_verdict(Verdict(result.digest, verdict))
             member.finished += verdict == "accepted"
             if work is not None:
                 member.host_stats.record_duration(work.kind, result.seconds)

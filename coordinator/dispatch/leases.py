@@ -56,6 +56,7 @@ class Leases:
         for digest in list(member.leases):
             self.drop(member, digest)
         member.unconfirmed.clear()
+        member.unconfirmed_verdicts = len(member.verdicts)
         member.trial_copies.clear()
 
     def move(self, move: Move, given: dict[str, list[ScoringJob]]) -> None:

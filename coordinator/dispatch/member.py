@@ -13,6 +13,7 @@ from dreamfleet.coordinator.dispatch.packing import SentBatch
 
 TRIAL_SECONDS = 60.0  # after which a trial copy without a result is forgotten
 MAX_BACKOFF = 4  # doublings of the pause before a batch is sent again
+MOST_VERDICTS = 4 * MAX_LEASES  # that wait for a heartbeat which confirms them
 ABSENT_HEARTBEATS = 2  # in a row that confirm a job's batch and do not list the job: its lease ends
 DEPARTED_TIMEOUT = 600.0  # seconds for which a departed worker is listed, unless its host is back
 MAX_DEPARTED = 256  # departed workers that are listed, the latest ones
@@ -94,6 +95,7 @@ class Member:
     last_sent: float = 0.0  # when anything was last sent to it
     unconfirmed: dict[int, SentBatch] = field(default_factory=dict)
     verdicts: list[Verdict] = field(default_factory=list)  # to send
+    unconfirmed_verdicts: int = 0  # to send, or sent in unconfirmed batches
     cancels: list[bytes] = field(default_factory=list)  # to send
 
     @property
@@ -197,6 +199,15 @@ class Member:
         """Slots that evaluations and collected rollouts take."""
         return self.held[True, False] + self.held[True, True]
 
+    def add_verdict(self, verdict: Verdict) -> None:
+        """Send a verdict with the next batch.
+
+        R26: only so many wait to be confirmed, so that no worker fills the memory. It repeats a result that has none.
+        """
+        if self.unconfirmed_verdicts < MOST_VERDICTS:
+            self.unconfirmed_verdicts += 1
+            self.verdicts.append(verdict)
+
     def start_numbering(self, numbering: int) -> None:
         """Number its batches from 1 again, and forget what was to be sent: the worker repeats its results.
 
@@ -204,7 +215,7 @@ class Member:
         """
         self.numbering, self.number, self.confirmed = numbering, 0, 0
         self.unconfirmed.clear()
-        self.cancels, self.verdicts = [], []
+        self.cancels, self.verdicts, self.unconfirmed_verdicts = [], [], 0
 
     def apply_heartbeat(self, beat: Heartbeat, now: float) -> list[SentBatch]:
         """Take what a heartbeat says of the worker; return the batches that it confirms for the first time.
@@ -222,6 +233,7 @@ class Member:
         if beat.running and beat.steps_per_second:
             self.host_stats.steps_per_second = beat.steps_per_second / len(beat.running)
         arrived = [self.unconfirmed.pop(number) for number in list(self.unconfirmed) if number <= beat.seen]
+        self.unconfirmed_verdicts -= sum(len(sent.verdicts) for sent in arrived)
         if arrived and all(sent.times == 1 for sent in arrived):  # of a repeated batch, any sending may have arrived
             since = max(self.last_delivery, min(sent.first_sent_at for sent in arrived))
             self.host_stats.record_transfer(sum(sent.size for sent in arrived), now - since)

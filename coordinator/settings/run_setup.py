@@ -81,8 +81,6 @@ def _check_effects(args: argparse.Namespace, config: RunConfig) -> None:
         "temperature": (dreams, f"--task {DREAM}"),
         "features": ("features" not in args.given or not config.needs_no_bundle, "a world model"),
         "collect_episodes": (config.collect_every, "--collect-every"),
-        "evaluation_episodes": (config.evaluate_every, "--evaluate-every"),
-        "confirm_episodes": (config.evaluate_every or not config.confirm_episodes, "--evaluate-every"),
     }
     for name, (has_effect, needed) in needs.items():
         if name in args.given and not has_effect:

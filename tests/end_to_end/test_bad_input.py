@@ -35,8 +35,6 @@ def complains(*arguments, says):
         (("--resume", "never"), "'never'"),
         (("--target", "900", "--evaluate-every", "0"), "--target"),
         (("--parted", "3", "--evaluate-every", "0"), "--parted"),
-        (("--confirm-episodes", "8", "--evaluate-every", "0"), "--confirm-episodes"),
-        (("--evaluation-episodes", "8", "--evaluate-every", "0"), "--evaluation-episodes"),
         (("--collect-episodes", "8"), "--collect-episodes"),
         (("--temperature", "1.3"), "--temperature"),
         (("--task", "gym:CartPole-v1", "--features", "z"), "--features"),

@@ -16,7 +16,7 @@ from dreamfleet.coordinator.dispatch.fleet import (
     SILENT_AFTER,
     UNCONFIRMED_TIMEOUT,
 )
-from dreamfleet.coordinator.dispatch.member import DEPARTED_TIMEOUT, MAX_DEPARTED
+from dreamfleet.coordinator.dispatch.member import DEPARTED_TIMEOUT, MAX_DEPARTED, MOST_VERDICTS
 from dreamfleet.coordinator.dispatch.speculative_execution import LONGEST_HELD, LONGEST_HELD_TIMES, UPLOAD_SECONDS
 from dreamfleet.coordinator.jobs.scoring_job import make_jobs, vector_bytes
 from tests.support.dispatched import BEAT, A, B, Fleet, beat, digests, fleet_of, join, result, work
@@ -413,6 +413,21 @@ def test_workers_without_a_heartbeat_are_few_and_soon_forgotten():
     assert [(each.what, each.worker) for each in fleet.notes] == [("joined", A)], (
         "unknown senders cannot fill the log with names"
     )
+
+
+def test_a_worker_that_confirms_nothing_fills_no_memory_and_hears_its_verdicts_once_it_does():
+    fleet = fleet_of(A)
+    member, made = fleet.members[A], iter(range(2**32))
+
+    def send_results(count):
+        for _ in range(count):
+            fleet.handle_result(A, result(next(made).to_bytes(32, "big")), 0.0)
+        return [verdict for batch in fleet.dispatch(0.0) for verdict in batch.verdicts]
+
+    sent = [len(send_results(1_000)) for _ in range(3 * MOST_VERDICTS // 1_000)]
+    assert sum(sent) == sum(len(batch.verdicts) for batch in member.unconfirmed.values()) == MOST_VERDICTS
+    fleet.handle_heartbeat(A, beat(seen=member.number), 0.0)
+    assert len(send_results(10)) == 10
 
 
 def test_a_member_is_forgotten_only_after_a_long_silence():
