@@ -1,7 +1,6 @@
 """The command line: verbs, settings, output, progress.
 
-Its pages: docs/how-to/configure.md, docs/reference/settings.md, docs/reference/exit-codes.md,
-docs/reference/presets.md.
+Its pages: docs/how-to/configure.md, docs/reference/settings.md, docs/reference/presets.md.
 """
 
 __all__ = [

@@ -1,6 +1,3 @@
-"""Files: atomic writes, bounded archives, locks, TensorBoard event files.
-
-Its pages: docs/reference/files.md, docs/how-to/unattended.md.
-"""
+"""Files: atomic writes, bounded archives, locks, TensorBoard event files."""
 
 __all__ = ["atomic_write", "regular_files", "archives", "locks", "file_system", "sqlite", "tensorboard"]

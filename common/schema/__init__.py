@@ -1,6 +1,3 @@
-"""Conversion of plain data to typed objects and back: validation, bounds, optional fields.
-
-Its pages: docs/reference/protocol.md.
-"""
+"""Conversion of plain data to typed objects and back: validation, bounds, optional fields."""
 
 __all__ = ["validation", "display", "times"]

@@ -133,6 +133,8 @@ def test_a_worker_that_dies_is_named_and_so_is_a_stop_from_elsewhere(alive, tmp_
 @pytest.mark.slow
 def test_a_run_goes_on_while_one_of_its_own_workers_may_score(tmp_path):
     with start_run(run="pole", runs_dir=tmp_path, **{**SMALL, "workers": 2, "generations": 10**6}) as run:
+        while not any(worker.name == "core-1" for worker in run.client.workers("pole")):
+            assert run._processes._workers[1].popen.poll() is None
         run.client.control("pole", "bar", "core-1")
         assert run._processes._workers[1].popen.wait(DEADLINE)
         assert "bar core-1 pole --no-longer" in run._processes._workers[1].last_line()
