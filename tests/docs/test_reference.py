@@ -16,6 +16,7 @@ from tests.support.processes import ROOT
 from tests.support.samples import STATUS
 
 
+@pytest.mark.wording
 def test_generated_pages_and_the_types_of_a_runs_settings_are_up_to_date():
     for name, text in reference.pages().items():
         assert (reference.FOLDER / name).read_text() == text, "run `make reference`"
@@ -29,6 +30,7 @@ def test_every_table_of_the_configuration_file_is_described_and_each_unit_is_of_
     assert reference.UNITS.keys() <= known
 
 
+@pytest.mark.wording
 def test_every_metric_is_described():
     page = (reference.FOLDER / "metrics.md").read_text()
     rows = {

@@ -145,6 +145,7 @@ def test_without_a_number_or_a_generation_there_is_no_estimate():
         assert estimate_eta(status(limits, seconds=1.0)).limits == ()
 
 
+@pytest.mark.wording
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
@@ -203,6 +204,7 @@ def test_a_spell_is_warned_of_again_only_after_as_many_other_generations(others,
     assert not found.is_due
 
 
+@pytest.mark.wording
 def test_enough_of_them_are_warned_of():
     for name, flag in (("gym:CartPole-v1", "--sigma0"), ("function:mine:cost", "scale=")):
         task = replace(STATUS.settings.task, task=name)

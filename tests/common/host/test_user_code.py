@@ -80,6 +80,7 @@ def test_a_module_sees_the_arguments_of_its_program_else_its_name(ours, monkeypa
         assert sys.argv == OURS
 
 
+@pytest.mark.wording
 @pytest.mark.parametrize("module", ["sqlite3.dbapi9", "no_such_module_of_mine", "no_such_package.inside"])
 def test_a_module_that_is_not_trusted_is_refused_with_each_remedy_that_is_needed(module, monkeypatch):
     monkeypatch.delenv(VARIABLE, raising=False)
