@@ -144,9 +144,7 @@ class Fleet:
         member, self.event_log.now, self.checked = self.members.get(identity), now, None
         given = self.find_job_for_result(identity, result)
         if given is None and (member is None or member.is_unconfirmed):
-            self.dropped["result of an unknown worker"] += (
-                1  # a worker of this run repeats it after its first heartbeat
-            )
+            self.dropped["result of an unknown worker"] += 1  # one of this run repeats it after its first heartbeat
             return "refused", None
         if member is not None:
             self._mark_heard(member, now)

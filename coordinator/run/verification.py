@@ -268,5 +268,6 @@ class Verification:
         """Which hosts wait for a further one, and what to do."""
         return (
             f"{self._describe_values(digest)}; neither gets further jobs until another host of their class scores it: "
-            "start a worker on one, or on the coordinator's own host; `dreamfleet resume` compares them again"
+            "start a worker on one, in a secured fleet with a join file of its own, or on the "
+            "coordinator's own host; `dreamfleet resume` compares them again"
         )

@@ -156,7 +156,7 @@ def test_idle_connections_delay_no_scrape_until_there_are_too_many(monkeypatch):
     port = free_port()
     with ExitStack() as stack, metrics_server.serve_metrics(str(port), snapshot, lambda: True):
         idle = [stack.enter_context(connect(port)) for _ in range(11)]
-        for _ in range(2):  # whoever is served makes room
+        for _ in range(2):  # a client that is served makes room
             until(lambda: scrapes(port), "a scrape")
         idle += [stack.enter_context(connect(port)) for _ in range(12)]
         assert select.select(idle, [], [], DEADLINE)[0], "those for whom there is no room are closed at once"
