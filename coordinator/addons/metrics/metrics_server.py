@@ -2,6 +2,7 @@
 
 import socket
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
@@ -14,7 +15,7 @@ from dreamfleet.common.transport.network import is_loopback_host, names_loopback
 from dreamfleet.coordinator.service.snapshot import Snapshot
 
 TIMEOUT = 5.0  # seconds for a request and its response
-MOST_CLIENTS = 64  # at a time, each in a thread; beyond them a connection is closed at once
+MOST_CLIENTS = 64  # at a time, each in a thread
 POLL = 0.1  # seconds
 LONGEST = 90.0  # seconds that an ended run waits for its scraper to see that it ended
 
@@ -69,21 +70,28 @@ class _MetricsServer(ThreadingHTTPServer):
         super().__init__(address, handler)
         self.scrapes = ScrapeTimes()
         self.is_loopback = is_loopback_host(address[0])
-        self._room = threading.Semaphore(MOST_CLIENTS)
+        self._open: dict[Any, str] = {}  # connection -> its address, the oldest first
+        self._lock = threading.Lock()
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Handle a connection in a thread, while there are few."""
-        if self._room.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)
+        """Handle a connection in a thread; where there are many, the oldest from the address with most gives way."""
+        with self._lock:
+            if len(self._open) >= MOST_CLIENTS:
+                [(most, _)] = Counter(self._open.values()).most_common(1)
+                oldest = next(each for each, address in self._open.items() if address == most)
+                del self._open[oldest]
+                with suppress(OSError):  # already closed
+                    oldest.shutdown(socket.SHUT_RDWR)
+            self._open[request] = client_address[0]
+        super().process_request(request, client_address)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         """Handle a connection, then make room for another."""
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._room.release()
+            with self._lock:
+                self._open.pop(request, None)
 
     def handle_error(self, *_: object) -> None:
         """Log nothing when a client disconnects or sends nothing."""

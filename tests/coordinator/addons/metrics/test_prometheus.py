@@ -150,17 +150,18 @@ def scrapes(port):
         return False
 
 
-def test_idle_connections_delay_no_scrape_until_there_are_too_many(monkeypatch):
+def test_idle_connections_delay_no_scrape_however_many_there_are(monkeypatch):
     monkeypatch.setattr(metrics_server, "TIMEOUT", 2 * DEADLINE)
     monkeypatch.setattr(metrics_server, "MOST_CLIENTS", 12)
     port = free_port()
     with ExitStack() as stack, metrics_server.serve_metrics(str(port), snapshot, lambda: True):
-        idle = [stack.enter_context(connect(port)) for _ in range(11)]
-        for _ in range(2):  # a client that is served makes room
-            until(lambda: scrapes(port), "a scrape")
-        idle += [stack.enter_context(connect(port)) for _ in range(12)]
-        assert select.select(idle, [], [], DEADLINE)[0], "those for whom there is no room are closed at once"
-        for each in idle:
+        other = stack.enter_context(socket.create_connection(("127.0.0.1", port), DEADLINE, ("127.0.0.2", 0)))
+        idle = [stack.enter_context(connect(port)) for _ in range(40)]
+        for _ in range(2):
+            assert scrapes(port)
+        until(lambda: len(select.select(idle, [], [], 0)[0]) >= 40 - 12, "those that gave way are closed")
+        assert select.select([other], [], [], 0)[0] == [], "another address holds fewer"
+        for each in (*idle, other):
             with suppress(OSError):
                 each.shutdown(socket.SHUT_RDWR)
 
