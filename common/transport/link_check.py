@@ -42,7 +42,7 @@ class LinkCheck:
             self._probe = self._threads.submit(self._find_routers)
         elif self._probe is not None and self._probe.done():
             found, self._probe, self._linked_at = self._probe.result(), None, now
-            return self._judge(found, set(map(str, session.info.routers_zid())))
+            return self._judge(found, {str(session.info.zid()), *map(str, session.info.routers_zid())})
         return []
 
     def _find_routers(self) -> dict[str, set[str]]:

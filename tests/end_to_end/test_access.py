@@ -256,6 +256,17 @@ def test_nobody_listens_beyond_this_host_without_security_unless_that_is_said(pr
     processes.refused(f"tls/0.0.0.0:{processes.port}", *words, "--join", access.path("coordinator"))
 
 
+@pytest.mark.slow
+def test_a_router_links_to_those_that_its_join_file_names(processes, tmp_path, access, endpoint, random_bundle):
+    near, joined = f"tls/127.0.0.1:{free_port()}", tmp_path / "near.join"
+    access.authority.issue("router", "near", joined, connect=[endpoint], hosts=["near.example"])
+    words = ("router", "--join", joined, "--access-dir", access.folder, "--listen", near)
+    assert processes.start(*words).wait_for_event("begin")["connect"] == [endpoint]
+    begin(processes, access, endpoint, random_bundle, "--generations", 1)
+    with Client(access.network("viewer", near)) as viewer:
+        until(viewer.runs, "a run behind the other router")
+
+
 @contextmanager
 def routed_by_the_verb(processes, *words):
     processes.start(*words).wait_for_event("begin")

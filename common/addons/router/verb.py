@@ -34,10 +34,13 @@ log = logging.getLogger("dreamfleet.router")
 
 @dataclass(frozen=True)
 class RouterConfig:
-    """Where a router of its own is reached. The site's `connect` is that very address, so it does not follow it."""
+    """Where a router of its own is reached. The site's `connect` is that very address, so it does not follow it.
+
+    The `connect` of its own join file was issued for it, so that holds where its own setting names none.
+    """
 
     listen: tuple[str, ...] = option((), f"listen here (default {DEFAULT_ENDPOINT})")
-    connect: tuple[str, ...] = option((), "link to these routers of other networks, whenever they are there")
+    connect: tuple[str, ...] = option((), "link to these routers of other networks (default: as the join file says)")
     insecure: bool = option(
         False, "listen beyond this host without a join file: anyone who reaches the port owns the runs behind it"
     )
@@ -63,10 +66,11 @@ def run(args: argparse.Namespace) -> int:
     credentials = load_credentials(args, ("router",))
     access_dir = args.global_config.access_dir
     revocations = RevocationWatcher(access_dir, credentials, named=access_dir != GlobalConfig.access_dir)
-    default = DEFAULT_ENDPOINT if credentials is None else SECURED_ENDPOINT
+    default, linked = (DEFAULT_ENDPOINT, ()) if credentials is None else (SECURED_ENDPOINT, credentials.connect)
     network = Network(
-        config.listen or args.global_config.listen or (default,), config.connect, credentials, revocations.revoked_seats
-    )
+        config.listen or args.global_config.listen or (default,), config.connect or linked, credentials,
+        revocations.revoked_seats,
+    )  # fmt: skip
     network.check_open(insecure=config.insecure)
     if args.print_config:
         if credentials is not None:

@@ -19,7 +19,7 @@ class Links:
 
     def __init__(self):
         self.routers, self.answering, self.tried = [], {}, 0
-        self.info = SimpleNamespace(routers_zid=lambda: self.routers)
+        self.info = SimpleNamespace(routers_zid=lambda: self.routers, zid=lambda: "own")
         self.check = LinkCheck(Network(connect=(FIRST, SECOND)), logging.getLogger("dreamfleet.router"))
         self.now = self.check._linked_at
 
@@ -83,3 +83,15 @@ def test_where_nobody_answers_the_session_stays(links, caplog):
         assert links.look() == []
     assert links.tried == 6
     assert events(caplog) == ["unlinked", "unlinked"]
+
+
+def test_a_router_whose_own_address_is_among_them_is_not_opened_anew(links, caplog):
+    links.answering = {FIRST: "own", SECOND: "a"}
+    links.routers = ["a"]
+    links.check._network = Network(listen=(FIRST,), connect=(FIRST, SECOND))
+    links.info.transports = links.info.links = list
+    for _ in range(3):
+        assert links.look(LINK_TIMEOUT) == []
+        assert links.look() == []
+    assert links.tried == 6
+    assert events(caplog) == []
