@@ -25,7 +25,8 @@ SIDES = ("common", "coordinator", "worker", "dreamfleet/experiments")  # and the
 # Words that a reader has to read twice; `style` in CONTRIBUTING.md says what to write instead.
 RIDDLES = re.compile(r"\b(tell|tells|telling|told|untold|whoever|whomever)\b|\b(?:is|are|was|were|be|been) had\b")
 LONG_FILE = 400
-PAGE = r"\bdocs/[\w/-]+\.md\b"  # as docstrings name it
+PAGE = r"\bdocs/[\w/-]+\.md\b"  # as code names it
+FEW = 4  # verbs that reach a file, pages that name a flag: as many are listed
 MANY = 4  # words of a text that a page would not have by chance
 GENERIC = ("run", "configure", "load", "option")  # functions of many files
 # The worlds that ship: what names each of them, and its rooms, the files and folders in which that may stand.
@@ -266,6 +267,20 @@ def subclasses(names: set[str], users: list[Path]) -> Iterator[str]:
                 yield f"{path}: {node.name}({base})"  # type: ignore[attr-defined]
 
 
+def pages_of(path: Path) -> set[str]:
+    """The pages that a file names: those behind "Pages:" in its docstring without their folder, and others with it."""
+    text = (ROOT / path).read_text()
+    listed = re.findall(r"[\w-]+\.md\b", (ast.get_docstring(ast.parse(text)) or "").partition("Pages:")[2])
+    by_name = {page.name: str(page.relative_to(ROOT)) for page in (ROOT / "docs").rglob("*.md")}
+    return {*re.findall(PAGE, text), *(by_name.get(name, name) for name in listed)}
+
+
+def flags_of(text: str) -> set[str]:
+    """The flags that a file adds: those of `add_argument`, and of fields that are an `option`."""
+    fields = re.findall(r"^    (\w+): [^=\n]+= option\(", text, re.MULTILINE)
+    return {*re.findall(r'add_argument\(\s*"(--[\w-]+)"', text), *(f"--{name.replace('_', '-')}" for name in fields)}
+
+
 def texts(*patterns: str) -> dict[str, str]:
     """The files of the repository that match, by path; what is made by another program is left out."""
     paths = (path for pattern in patterns for path in sorted(ROOT.glob(pattern)))
@@ -287,6 +302,9 @@ def about(path: Path) -> dict[str, list[str]]:
     named = rf"\b({re.escape(file)}|{re.escape(module)})\b"
     groups = dict(CONFIG["project"]["entry-points"])
     verbs = {name.replace(".", " "): value.partition(":")[0] for name, value in groups.pop("dreamfleet.verbs").items()}
+    through = users_of(module, imported)
+    reached = {module, *through}
+    near = sorted(verb for verb, of in verbs.items() if of in reached)
     own_verbs = [verb.split() for verb, of in verbs.items() if of == module]
     between = r"""["', ]+"""
     calls = [rf"""(\(|dreamfleet["'],?)\s*["']{between.join(verb)}["']""" for verb in own_verbs]
@@ -295,7 +313,8 @@ def about(path: Path) -> dict[str, list[str]]:
     worlds = [
         f"(?i:{name.pattern})" for name, rooms in WORLDS.items() if any(path.is_relative_to(room) for room in rooms)
     ]
-    pages = re.findall(PAGE, text + (ROOT / room).read_text())
+    rooms = [each / "__init__.py" for each in path.parents if (ROOT / each / "__init__.py").exists()]
+    pages = set().union(*map(pages_of, (path, *rooms)))
     in_code = re.compile("|".join([named, *calls, *written]))
     in_pages = re.compile("|".join([named, *written, *codes, *worlds]))
     own_test = Path(f"tests/{path.parent}/test_{path.name}".replace("dreamfleet/", ""))
@@ -303,6 +322,8 @@ def about(path: Path) -> dict[str, list[str]]:
     naming = {each for each in sources("tests") if in_code.search((ROOT / each).read_text())}
     product = [each for each in users if each.parts[0] != "tests"]
     tests = [*own, *sorted({*users, *naming} - {*own, *product})]  # those of its own first
+    run = [rf"""(\(|dreamfleet["'],?)\s*["']{between.join(verb.split())}["']""" for verb in near]
+    running = [each for each in sources("tests") if re.search("|".join(run) or "$^", (ROOT / each).read_text())]
     outside = [each for each in product if each.parent != path.parent]
     if f'"{path.stem}"' in (ROOT / room).read_text():
         listed = "the room lists it for others"
@@ -311,9 +332,6 @@ def about(path: Path) -> dict[str, list[str]]:
     kind = "core" if path in core() else "an add-on" if "addons" in path.parts else "neither core nor add-on"
     documents = texts("README.md", "CONTRIBUTING.md", "docs/**/*.md", ".github/**/*")
     scripts = texts("Makefile", ".ci/run", "deploy/**/*", "docs/**/*.py")
-    through = users_of(module, imported)
-    reached = {module, *through}
-    near = sorted(verb for verb, of in verbs.items() if of in reached)
     points = [
         f"{each}: {name}"
         for each, of in groups.items()
@@ -323,6 +341,9 @@ def about(path: Path) -> dict[str, list[str]]:
     said = {" ".join(each.split()) for each in words_of(path) if len(each.split()) >= MANY}
     flat = {name: " ".join(page.split()) for name, page in documents.items()}
     quoted = {name for name, page in flat.items() if any(map(page.__contains__, said))}
+    for flag in flags_of(text):
+        found = {name for name, page in flat.items() if re.search(rf"(?<![\w-]){flag}(?![\w-])", page)}
+        quoted |= found if len(found) <= FEW else set()
     return {
         str(path): [ast.get_docstring(ast.parse(text)) or ""],
         str(path.parent): [ast.get_docstring(ast.parse((ROOT / room).read_text())) or "", listed, kind],
@@ -330,6 +351,7 @@ def about(path: Path) -> dict[str, list[str]]:
         "imported by": [f"{each} ({', '.join(names_taken(each, module)) or 'the module'})" for each in product],
         "extended by": list(subclasses(set(public), users)),
         "tests": list(map(str, tests)),
+        "and those of its verbs": sorted(map(str, {*running} - {*tests})) if len(near) <= FEW else [],
         "reached by the entry points": points,
         "and by the verbs (docs/reference/verbs.md)": [", ".join(near) if len(near) <= 12 else "most of them"],
         "named in": [

@@ -1,6 +1,6 @@
 """Files that a run reads and writes: bundles, controllers, agents, subspaces.
 
-Its pages: docs/reference/files.md, docs/reference/worlds.md, docs/reference/import.md, docs/explanation/determinism.md.
+Pages: files.md, worlds.md, import.md, determinism.md.
 """
 
 __all__ = [

@@ -1,7 +1,4 @@
-"""The command line: verbs, settings, output, progress.
-
-Its pages: docs/how-to/configure.md, docs/reference/settings.md, docs/reference/presets.md.
-"""
+"""The command line: verbs, settings, output, progress. Pages: configure.md, settings.md, presets.md."""
 
 __all__ = [
     "command_line",

@@ -1,6 +1,6 @@
 """The host and its processes: resource limits, signals, logs, streams, child processes.
 
-Its pages: docs/reference/platforms.md, docs/how-to/unattended.md.
+Pages: platforms.md, unattended.md.
 """
 
 __all__ = [

@@ -1,7 +1,4 @@
-"""The Zenoh protocol: keys, messages, their encoding and their bounds.
-
-Its pages: docs/reference/protocol.md, docs/reference/glossary.md.
-"""
+"""The Zenoh protocol: keys, messages, their encoding and their bounds. Pages: protocol.md, glossary.md."""
 
 __all__ = [
     "keys",

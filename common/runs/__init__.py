@@ -1,6 +1,6 @@
 """Runs on disk: their journals as typed records, schedules, provenance and evaluation reports.
 
-Its pages: docs/reference/files.md, docs/how-to/stages.md, docs/how-to/stop-and-resume.md, docs/reference/settings.md.
+Pages: files.md, stages.md, stop-and-resume.md, settings.md.
 """
 
 __all__ = [

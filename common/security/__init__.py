@@ -1,6 +1,3 @@
-"""A secured fleet: join files, certificates, access rules, connection limits.
-
-Its pages: docs/how-to/security.md, docs/explanation/threats.md.
-"""
+"""A secured fleet: join files, certificates, access rules, connection limits. Pages: security.md, threats.md."""
 
 __all__ = ["credentials", "access_rules", "handshake", "certificate_ledger", "connection_limiter", "host_key"]

@@ -1,6 +1,3 @@
-"""Zenoh sessions, endpoints, queries and the router.
-
-Its pages: docs/how-to/router.md, docs/reference/protocol.md, docs/explanation/threats.md.
-"""
+"""Zenoh sessions, endpoints, queries and the router. Pages: router.md, protocol.md, threats.md."""
 
 __all__ = ["session", "link_check", "query", "network"]

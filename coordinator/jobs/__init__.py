@@ -1,6 +1,6 @@
 """What a run scores: generations, evaluations, confirmations and kept rollouts, as jobs. Pure.
 
-Its pages: docs/reference/protocol.md, docs/how-to/stages.md, docs/how-to/rounds.md.
+Pages: protocol.md, stages.md, rounds.md.
 """
 
 __all__ = [

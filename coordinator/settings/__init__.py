@@ -1,6 +1,6 @@
 """What a run is: settings, presets, schedule, starting point, how it is resumed or rerun.
 
-Its pages: docs/reference/settings.md, docs/reference/presets.md, docs/how-to/stages.md.
+Pages: settings.md, presets.md, stages.md.
 """
 
 __all__ = [

@@ -1,6 +1,6 @@
 """The run's journal, a copy of its database, and a watch over its files.
 
-Its pages: docs/reference/files.md, docs/how-to/back-up.md, docs/how-to/stop-and-resume.md.
+Pages: files.md, back-up.md, stop-and-resume.md.
 """
 
 __all__ = [

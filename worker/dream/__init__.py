@@ -8,7 +8,7 @@ Importing this registers `dreamfleet/Dream-v0` for the world of any bundle, also
 >>> environment.metadata["render_fps"]
 50
 
-Its pages: docs/explanation/dreams.md, docs/reference/tasks.md, docs/reference/worlds.md.
+Pages: dreams.md, tasks.md, worlds.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The worker service: it joins a run, scores jobs, and delivers each result until it is acknowledged.
 
-Its pages: docs/reference/protocol.md, docs/how-to/hosts.md, docs/how-to/unattended.md, docs/how-to/mixed-hosts.md.
+Pages: protocol.md, hosts.md, unattended.md, mixed-hosts.md.
 """
 
 __all__ = [

@@ -1,6 +1,6 @@
 """Tasks: the contract between an environment, a policy and the rest of the system, and finding tasks by name.
 
-Its pages: docs/reference/tasks.md, docs/reference/python.md.
+Pages: tasks.md, python.md.
 """
 
 __all__ = [

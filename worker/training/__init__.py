@@ -1,6 +1,6 @@
 """From nothing to a bundle: collect, train the VAE, encode, train the MDN-RNN, bundle.
 
-Its pages: docs/how-to/train.md, docs/reference/presets.md, docs/tutorials/own-world-model.md.
+Pages: train.md, presets.md, own-world-model.md.
 """
 
 __all__ = [

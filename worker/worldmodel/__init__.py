@@ -2,7 +2,7 @@
 
 What `scoring` imports of it has no torch.
 
-Its pages: docs/explanation/determinism.md, docs/reference/worlds.md, docs/reference/import.md, docs/how-to/train.md.
+Pages: determinism.md, worlds.md, import.md, train.md.
 """
 
 import os

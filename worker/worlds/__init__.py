@@ -1,4 +1,1 @@
-"""The worlds that ship; each is a task, registered by its entry point.
-
-Its pages: docs/reference/tasks.md, docs/reference/worlds.md.
-"""
+"""The worlds that ship; each is a task, registered by its entry point. Pages: tasks.md, worlds.md."""

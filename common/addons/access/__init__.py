@@ -1,6 +1,3 @@
-"""Join files: an authority issues, lists and revokes them.
-
-Its pages: docs/how-to/security.md, docs/how-to/share-a-fleet.md.
-"""
+"""Join files: an authority issues, lists and revokes them. Pages: security.md, share-a-fleet.md."""
 
 __all__ = ["verb"]

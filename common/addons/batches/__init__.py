@@ -1,6 +1,3 @@
-"""Candidates of your own, scored by a fleet.
-
-Its pages: docs/how-to/ask-tell.md, docs/reference/python.md.
-"""
+"""Candidates of your own, scored by a fleet. Pages: ask-tell.md, python.md."""
 
 __all__ = ["remote_scorer", "batch_client"]

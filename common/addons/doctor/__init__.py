@@ -1,6 +1,3 @@
-"""What a host can do: checks of `dreamfleet doctor`.
-
-Its pages: docs/how-to/troubleshooting.md, docs/tutorials/first-drive.md.
-"""
+"""What a host can do: checks of `dreamfleet doctor`. Pages: troubleshooting.md, first-drive.md."""
 
 __all__ = ["verb", "health"]

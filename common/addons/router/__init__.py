@@ -1,6 +1,3 @@
-"""A Zenoh router between hosts that do not reach each other.
-
-Its pages: docs/how-to/router.md, docs/how-to/security.md.
-"""
+"""A Zenoh router between hosts that do not reach each other. Pages: router.md, security.md."""
 
 __all__ = ["verb"]

@@ -1,6 +1,3 @@
-"""A task tried in a child process before a run uses it.
-
-Its pages: docs/reference/tasks.md, docs/tutorials/own-environment.md.
-"""
+"""A task tried in a child process before a run uses it. Pages: tasks.md, own-environment.md."""
 
 __all__ = ["verb", "task_check"]

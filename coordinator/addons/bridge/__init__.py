@@ -1,6 +1,3 @@
-"""The bridge: batches over HTTP with JSON, for searches in any language.
-
-Its pages: docs/how-to/ask-tell.md.
-"""
+"""The bridge: batches over HTTP with JSON, for searches in any language. Pages: ask-tell.md."""
 
 __all__ = ["verb"]

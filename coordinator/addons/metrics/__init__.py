@@ -1,6 +1,3 @@
-"""A run's metrics for Prometheus.
-
-Its pages: docs/reference/metrics.md, docs/how-to/monitor.md.
-"""
+"""A run's metrics for Prometheus. Pages: metrics.md, monitor.md."""
 
 __all__ = ["metrics_server", "prometheus"]

@@ -1,6 +1,3 @@
-"""Optimisers beside CMA-ES.
-
-Its pages: docs/reference/optimisers.md.
-"""
+"""Optimisers beside CMA-ES. Pages: optimisers.md."""
 
 __all__ = ["cmaes_library", "search_gradients"]

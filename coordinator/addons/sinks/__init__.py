@@ -1,6 +1,3 @@
-"""A run's numbers sent to other programs while it goes on.
-
-Its pages: docs/how-to/monitor.md, docs/reference/python.md.
-"""
+"""A run's numbers sent to other programs while it goes on. Pages: monitor.md, python.md."""
 
 __all__ = ["live_log", "sinks"]

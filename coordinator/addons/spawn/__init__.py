@@ -1,6 +1,6 @@
 """Start workers on other hosts over ssh, each in its own folder there.
 
-Its pages: docs/how-to/hosts.md, docs/how-to/share-a-fleet.md, docs/how-to/troubleshooting.md.
+Pages: hosts.md, share-a-fleet.md, troubleshooting.md.
 """
 
 __all__ = ["verb"]

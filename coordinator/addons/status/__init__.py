@@ -1,6 +1,3 @@
-"""A run's status on a terminal.
-
-Its pages: docs/reference/status.md, docs/how-to/watch.md, docs/tutorials/fleet.md.
-"""
+"""A run's status on a terminal. Pages: status.md, watch.md, fleet.md."""
 
 __all__ = ["verb", "status_panel"]

@@ -1,6 +1,6 @@
 """One small web server for add-ons: its address, limits, guard and streams of events.
 
-Its pages: docs/how-to/dashboard.md, docs/how-to/ask-tell.md, docs/explanation/threats.md.
+Pages: dashboard.md, ask-tell.md, threats.md.
 """
 
 __all__ = ["server", "address", "documents", "guard"]

@@ -3,7 +3,7 @@
 Pure: `config`, `plan`, `layout`, `requests`, `gate`, `summary`. `ledger` and `artefacts` read and write files, `phases`
 does one phase, `runner` goes from one to the next.
 
-Its pages: docs/how-to/rounds.md, docs/reference/files.md.
+Pages: rounds.md, files.md.
 """
 
 __all__ = ["runner", "phases", "summary", "ledger", "plan", "config", "layout"]

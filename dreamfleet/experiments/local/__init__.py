@@ -1,6 +1,6 @@
 """What experiments stand on: processes of this host, their command lines, kept documents, arguments of searches.
 
-Its pages: docs/reference/python.md.
+Pages: python.md.
 """
 
 __all__ = [

@@ -1,6 +1,6 @@
 """Measurements that are ratios from one run: cases take turns in blocks, medians count.
 
-Its pages: docs/lab/measurements.md, docs/how-to/gpu.md.
+Pages: measurements.md, gpu.md.
 """
 
 __all__ = ["verb"]

@@ -1,6 +1,3 @@
-"""Bundles taken apart, or rounded to eight bits.
-
-Its pages: docs/reference/worlds.md, docs/reference/import.md.
-"""
+"""Bundles taken apart, or rounded to eight bits. Pages: worlds.md, import.md."""
 
 __all__ = ["verb", "extract", "weights_from_graphs"]

@@ -1,6 +1,3 @@
-"""A controller as a folder to publish.
-
-Its pages: docs/how-to/export.md.
-"""
+"""A controller as a folder to publish. Pages: export.md."""
 
 __all__ = ["verb"]

@@ -1,6 +1,3 @@
-"""Driving by hand, on the track or in the dream.
-
-Its pages: docs/tutorials/first-drive.md, docs/reference/tasks.md.
-"""
+"""Driving by hand, on the track or in the dream. Pages: first-drive.md, tasks.md."""
 
 __all__ = ["verb", "picture_window"]

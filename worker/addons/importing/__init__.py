@@ -1,6 +1,3 @@
-"""Controllers, world models and drives of other projects, read as data and never executed.
-
-Its pages: docs/reference/import.md.
-"""
+"""Controllers, world models and drives of other projects, read as data and never executed. Pages: import.md."""
 
 __all__ = ["verb"]

@@ -1,6 +1,3 @@
-"""Drives and dreams in a window while they happen.
-
-Its pages: docs/how-to/watch.md.
-"""
+"""Drives and dreams in a window while they happen. Pages: watch.md."""
 
 __all__ = ["verb"]

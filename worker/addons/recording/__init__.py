@@ -1,6 +1,3 @@
-"""Videos of drives and dreams.
-
-Its pages: docs/tutorials/first-drive.md, docs/reference/worlds.md.
-"""
+"""Videos of drives and dreams. Pages: first-drive.md, worlds.md."""
 
 __all__ = ["verb", "recording", "drive_frames", "canvas", "parallel_dream", "video"]

@@ -1,6 +1,3 @@
-"""Dreams on a torch device.
-
-Its pages: docs/how-to/gpu.md, docs/explanation/determinism.md.
-"""
+"""Dreams on a torch device. Pages: gpu.md, determinism.md."""
 
 __all__ = ["torch_batch"]

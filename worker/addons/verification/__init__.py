@@ -1,6 +1,3 @@
-"""Scores driven again: a candidate of a run, a report.
-
-Its pages: docs/explanation/determinism.md, docs/reference/files.md.
-"""
+"""Scores driven again: a candidate of a run, a report. Pages: determinism.md, files.md."""
 
 __all__ = ["candidate_verb", "report_verb"]

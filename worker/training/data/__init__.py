@@ -1,7 +1,4 @@
-"""A data set of recorded drives: collected, stored, read.
-
-Its pages: docs/how-to/train.md, docs/reference/files.md.
-"""
+"""A data set of recorded drives: collected, stored, read. Pages: train.md, files.md."""
 
 __all__ = [
     "dataset",

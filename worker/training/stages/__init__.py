@@ -1,6 +1,6 @@
 """The stages that make a world model, as functions: a typed request in, a typed report out. Verbs parse and print.
 
-Its pages: docs/how-to/train.md, docs/how-to/rounds.md.
+Pages: train.md, rounds.md.
 """
 
 from dataclasses import asdict, dataclass

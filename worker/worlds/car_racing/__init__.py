@@ -5,7 +5,7 @@ Importing this registers `dreamfleet/CarRacing-v3` and `dreamfleet/CarRacingLate
 >>> import gymnasium, dreamfleet.worker.worlds.car_racing
 >>> environment = gymnasium.make("dreamfleet/CarRacing-v3")
 
-Its pages: docs/reference/tasks.md, docs/explanation/sources.md, docs/lab/operations-notes.md.
+Pages: tasks.md, sources.md, operations-notes.md.
 """
 
 from __future__ import annotations

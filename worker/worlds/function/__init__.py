@@ -1,6 +1,3 @@
-"""Any Python function of a vector as a task: `function:MODULE:NAME`.
-
-Its pages: docs/tutorials/own-objective.md, docs/reference/tasks.md.
-"""
+"""Any Python function of a vector as a task: `function:MODULE:NAME`. Pages: own-objective.md, tasks.md."""
 
 __all__ = ["task"]
