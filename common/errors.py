@@ -1,4 +1,4 @@
-"""The errors that users see. Each text says what happened and what to do about it."""
+"""The errors that users see. Each text says what happened and what to do about it. Pages: exit-codes.md."""
 
 import shlex
 from errno import EACCES, EDQUOT, EISDIR, ENOSPC, EPERM, EROFS
@@ -78,7 +78,7 @@ class NotWritableNowError(JournalError):
 
 def write_error(path: object, error: OSError) -> JournalError:
     """The error for a file of a run that cannot be written."""
-    what = f"cannot write {path}: {error.strerror or error}"
+    what = f"cannot write {path}: {error.strerror or error}"  # docs/how-to/troubleshooting.md has this text
     if is_disk_full(error):
         return NotWritableNowError(f"{what}; make room")
     remedies = {EISDIR: "; remove it", EACCES: "; make it writable", EPERM: "; make it writable",

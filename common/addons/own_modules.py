@@ -1,4 +1,7 @@
-"""Trust the module of a run that this user began on this host, if nobody else can change its code."""
+"""Trust the module of a run that this user began on this host, if nobody else can change its code.
+
+Pages: trust.md, files.md.
+"""
 
 from __future__ import annotations
 

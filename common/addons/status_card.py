@@ -1,4 +1,7 @@
-"""A live run in a notebook: a card of its status that is replaced in place, as plain HTML without scripts."""
+"""A live run in a notebook: a card of its status that is replaced in place, as plain HTML without scripts.
+
+Pages: python.md.
+"""
 
 from collections.abc import Iterable, Sequence
 from html import escape

@@ -1,4 +1,4 @@
-"""Files that a run reads and writes: bundles, controllers, agents, subspaces.
+"""Files that a run reads and writes: bundles, controllers, agents, subspaces; their actions and options.
 
 Pages: files.md, worlds.md, import.md, determinism.md.
 """

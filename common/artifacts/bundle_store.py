@@ -100,7 +100,7 @@ class BundleStore:
         with self.reporting_write_errors():
             if (found := hash_file(partial)) != sha256:
                 partial.unlink()
-                raise BundleError(
+                raise BundleError(  # docs/how-to/troubleshooting.md has this text
                     f"the bundle arrived damaged: its hash is {found[:12]}..., not {sha256[:12]}...; try again"
                 )
             partial.replace(path)

@@ -1,7 +1,7 @@
 """The evolved controller: its shape, its flat parameter vector, and its formula in NumPy.
 
 A linear layer on the world model's latent z and hidden state h (Ha & Schmidhuber 2018, section 2.3): W [z; h] + b,
-which the task converts to an action. Variants see z alone, or have a layer of tanh units between.
+which the task converts to an action. Variants see z alone, or have a layer of tanh units between. Pages: security.md.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 FORMAT = 1
 IMPORTED = "imported"  # in the provenance: the name of another program's file
 PREDICTORS = "dreamfleet.predictors"  # entry points: what makes a `Predictor` of a controller, on hosts that score
-_LIMITS = ArchiveLimits(64 << 20, members=8)  # 16 million parameters, more than any search has
+_LIMITS = ArchiveLimits(64 << 20, members=8)  # 16 million parameters, more than any search has; client.py has it too
 _TASK_DEFAULTS: dict[str, Any] = {"options": "", "version": 1}  # written only where a task's values differ
 
 

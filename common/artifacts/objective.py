@@ -23,8 +23,8 @@ from dreamfleet.common.printable import plural
 
 Floats = NDArray[np.float64]
 LARGEST_EXPONENT = 700.0  # of e: above it no double is finite
-KEY = "environment"  # of a task's options, as `--environment` gives them
-EXAMPLE = "x0=[0,0,0]"
+KEY = "environment"  # of a task's options, as `--environment` gives them: docs/reference/tasks.md
+EXAMPLE = "x0=[0,0,0]"  # docs/reference/python.md has the same as arguments
 _DEFAULTS: dict[str, Any] = {
     "scale": 1.0, "lower": None, "upper": None, "integer": [], "log": [], "minimise": False, "penalty": None,
 }  # fmt: skip

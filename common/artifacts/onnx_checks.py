@@ -1,4 +1,4 @@
-"""Checks of ONNX models and arrays from untrusted files, without the libraries that run them."""
+"""Checks of ONNX models and arrays from untrusted files, without the libraries that run them. Pages: protocol.md."""
 
 from __future__ import annotations
 

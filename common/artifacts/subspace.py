@@ -2,7 +2,7 @@
 
 A linear controller on [z, h] has hundreds of weights, and each costs the search evaluations. In a subspace the search
 varies W = W0 + C M and b = b0 + C m + c only: M and m map the inputs to K features, and the coordinates C, c are the
-optimiser's variables. Published, journalled and reported are the full parameters.
+optimiser's variables. Published, journalled and reported are the full parameters. Pages: optimisers.md.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ class SearchSpace:
     shape: ControllerShape
 
     @property
-    def dimension(self) -> int:
+    def dimension(self) -> int:  # docs/how-to/quality-diversity.md has CarRacing's
         """Number of coordinates: K weights and a bias for each output of the first layer, and all other parameters."""
         outputs, inputs = self.shape.layers[0]
         return outputs * (len(self.subspace.names) + 1) + self.shape.size - outputs * (inputs + 1)

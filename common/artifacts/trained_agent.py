@@ -22,7 +22,7 @@ from dreamfleet.common.schema.validation import MalformedError, Word, from_plain
 
 FORMAT = 1
 MANIFEST, NETWORK = "agent.json", "network.onnx"
-MAX_BYTES = 256 << 20  # of the file, and of its members together
+MAX_BYTES = 256 << 20  # of the file, and of its members together; docs/how-to/security.md says it too
 _LIMITS = ArchiveLimits(MAX_BYTES, members=8)
 _MAX_MANIFEST = 1_000_000
 MAX_FRAME_SKIP, MAX_STATE_SIZE = 10**6, 10**6

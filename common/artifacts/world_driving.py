@@ -21,7 +21,7 @@ class Driving:
     HELP: ClassVar[dict[str, str]] = {"decide_every": "a whole number from 1 to 50", "feedback": "none or last"}
     WHOSE: ClassVar[str] = ""  # options they are, in an error
 
-    decide_every: int = field(default=1, kw_only=True)  # steps for which an action is repeated
+    decide_every: int = field(default=1, kw_only=True)  # steps for which an action is repeated: docs/reference/tasks.md
     # last: the last action and its change are features too
     feedback: Literal["none", "last"] = field(default="none", kw_only=True)
 

@@ -17,7 +17,7 @@ from dreamfleet.common.artifacts.actions import MAX_OUTPUTS, Continuous
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.schema.validation import OPTIONAL, MalformedError, Word
 
-DRAWN: Final = "drawn"  # the text of the rule that draws its ends
+DRAWN: Final = "drawn"  # the text of the rule that draws its ends (docs/explanation/dreams.md)
 ODDS_WEIGHTS: Final = (1e-6, 1e6)  # the least and the most
 MAX_OPTIONS = 20_000  # characters of a task's options
 # One number for each component of an action

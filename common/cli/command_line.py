@@ -3,7 +3,7 @@
 A verb is a module with `SUMMARY`, `EXTRAS`, `configure(parser)` and `run(args)`. One with many flags names those that
 `--help` shows in a text `FIRST`, and what to give for flags that it lacks in a dictionary `ELSEWHERE`. A dot in its
 name is a space on the command line: `train.vae` is `dreamfleet train vae`. Only the requested verb's module is loaded,
-and it imports heavy packages in `run`.
+and it imports heavy packages in `run`. Pages: exit-codes.md, README.md.
 """
 
 import argparse

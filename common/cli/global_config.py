@@ -114,7 +114,7 @@ def read_arguments(args: argparse.Namespace, environment: Mapping[str, str] = os
 def _named_modules(args: argparse.Namespace, environment: Mapping[str, str], file: Mapping[str, Any]) -> list[str]:
     """The modules of the tasks and optimisers that the user names by a flag, a variable or the configuration file."""
     names: list[object] = []
-    for setting in ("task", "optimiser"):
+    for setting in ("task", "optimiser"):  # docs/how-to/trust.md says which
         given = getattr(args, setting, ())
         names += given if isinstance(given, list) else [given]
         names += [environment.get(f"{PREFIX}RUN_{setting.upper()}"), file.get("run", {}).get(setting)]

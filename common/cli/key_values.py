@@ -1,4 +1,4 @@
-"""Texts of flags: KEY=VALUE, and flags of another verb."""
+"""Texts of flags: KEY=VALUE, and flags of another verb. Pages: tasks.md, rounds.md."""
 
 import json
 import shlex

@@ -1,4 +1,4 @@
-"""Output of verbs on stdout: aligned tables, or JSON with `--json`."""
+"""Output of verbs on stdout: aligned tables, or JSON with `--json`. Pages: exit-codes.md."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Names of presets: of a run's settings, of a training's settings, and of learning baselines.
 
 The coordinator and the worker define their own presets. The names are here so that an error can say which verb knows a
-preset of that name. docs/reference/presets.md lists all.
+preset of that name. docs/reference/presets.md lists all. Pages: train.md, worlds.md.
 """
 
 from typing import Literal

@@ -1,4 +1,4 @@
-"""The best candidate of each cell, whichever optimiser asked for it."""
+"""The best candidate of each cell, whichever optimiser asked for it. Pages: quality-diversity.md."""
 
 import math
 from collections.abc import Sequence

@@ -14,7 +14,7 @@ from dreamfleet.common.protocol.tasks import step_unit
 from dreamfleet.common.runs.effort import format_steps
 from dreamfleet.common.runs.records import in_values
 
-PACE_WINDOW = 10  # closed generations that tell the pace
+PACE_WINDOW = 10  # closed generations that tell the pace (docs/reference/metrics.md)
 SLOWER = 1.5  # times the pace that the present workers need, from which on they set it: less is noise of episodes
 STALL_SECONDS = 60.0  # how long a generation that is overdue makes no step until its end is unknown
 ACTIVE_STATES = ("running", "evaluating")

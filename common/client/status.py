@@ -30,7 +30,7 @@ from dreamfleet.common.schema.validation import (
     from_plain_lenient,
 )
 
-STATUS_SCHEMA_VERSION = 2
+STATUS_SCHEMA_VERSION = 2  # docs/reference/protocol.md has it too
 PARTS = ("", "generation", "workers", "history", "evaluations", "candidates", "best", "story")
 FINAL_STATES = ("ended", "left")  # the coordinator leaves in these states
 LongText = Annotated[str, Meta(max_length=10_000)]

@@ -1,7 +1,7 @@
 """Reading zip archives and `.npz` files from untrusted sources within bounds, and writing reproducible zips.
 
 Every reader of a bundle, a controller, a rollout or an optimiser's state uses this module. Declared sizes are checked
-before anything is unpacked, and unpacked sizes against the declared ones. Pickle is never loaded.
+before anything is unpacked, and unpacked sizes against the declared ones. Pickle is never loaded. Pages: security.md.
 """
 
 import io

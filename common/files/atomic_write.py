@@ -1,4 +1,4 @@
-"""Atomic writes, and checks of a verb's `--out` before it works for minutes."""
+"""Atomic writes, and checks of a verb's `--out` before it works for minutes. Pages: troubleshooting.md."""
 
 import os
 from collections.abc import Iterator

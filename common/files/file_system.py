@@ -14,7 +14,7 @@ NETWORK = frozenset({
 })  # fmt: skip
 ROOM = 1 << 18  # bytes that the trial needs
 LEAST_ROOM = 1 << 16  # bytes; the index of a write-ahead log has half of them
-REMEDY = (
+REMEDY = (  # also in docs/how-to/back-up.md and docs/how-to/troubleshooting.md
     "choose a --runs-dir on a local disk, such as $TMPDIR or the node's /scratch, and copy the run's folder from there "
     "when its coordinator has ended"
 )

@@ -1,4 +1,4 @@
-"""SQLite databases: a connection for each thread that reads one, and what an error says of one."""
+"""SQLite databases: a connection for each thread that reads one, and what an error says of one. Pages: python.md."""
 
 import sqlite3
 from collections.abc import Callable

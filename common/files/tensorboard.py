@@ -1,4 +1,4 @@
-"""TensorBoard event files: scalars over steps. tensorboardX writes them, so torch is not needed."""
+"""TensorBoard event files: scalars over steps. tensorboardX writes them, so torch is not needed. Pages: monitor.md."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 FILE_VERSION = "brain.Event:2"
 EVENTS = "events.out.tfevents.*"  # names of the files
-EXTRA = "pip install 'dreamfleet[export]'"
+EXTRA = "pip install 'dreamfleet[export]'"  # docs/how-to/export.md has it too
 
 
 class EventFileWriter:

@@ -1,4 +1,4 @@
-"""The host and its processes: resource limits, signals, logs, streams, child processes.
+"""The host and its processes: resource limits, signals, logs, streams, child processes, packages, users' modules.
 
 Pages: platforms.md, unattended.md.
 """

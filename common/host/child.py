@@ -97,7 +97,7 @@ class Child:
             self.ask_to_end()
             self.wait(timeout)
         self.kill()
-        has_ended = self.wait(limit)
+        has_ended = self.wait(limit)  # else it is left behind: docs/how-to/monitor.md
         if self._descendants:
             self._descendants.forget()
         return has_ended

@@ -23,7 +23,7 @@ if __name__ == "__main__":  # the guard, whose interpreter starts without a look
 import psutil
 
 VARIABLE = "DREAMFLEET_DESCENDS_FROM"  # marks, each followed by a space
-GUARD_LIMIT = 2.0  # seconds in which the guard ends the descendants of a process that exits
+GUARD_LIMIT = 2.0  # seconds in which the guard ends the descendants of a process that exits (docs/how-to/monitor.md)
 ROUNDS = 20  # a process may fork while the others are looked for
 _TOKEN = f"{os.getpid()}-{os.urandom(8).hex()}"
 _numbers = itertools.count()

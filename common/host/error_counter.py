@@ -1,7 +1,7 @@
 """Counting and logging errors in message handlers.
 
 No message of a peer may end a loop: a message whose handler raises is dropped, and its sender repeats it if it
-matters. Every drop is counted; the log gets the first of a kind, then ever fewer.
+matters. Every drop is counted; the log gets the first of a kind, then ever fewer. Pages: protocol.md, decisions.md.
 """
 
 import logging

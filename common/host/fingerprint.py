@@ -1,7 +1,7 @@
 """A host's fingerprint: CPU features, libc, and the versions of the packages that compute a fitness.
 
 Equal fingerprints do not guarantee equal bits; host classes compare the results themselves
-(`common/protocol/host_classes.py`).
+(`common/protocol/host_classes.py`). Pages: mixed-hosts.md, determinism.md.
 """
 
 import platform

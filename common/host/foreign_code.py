@@ -24,7 +24,7 @@ def contained(what: str) -> Iterator[None]:
     latest. After `SLOW` seconds a warning says `what` takes so long.
     """
     starting = nullcontext() if os.environ.get(VARIABLE) else Descendants().starting()  # another process may end them
-    with _warning_if_slow(what), starting, answer_kept(), handlers_kept():
+    with _warning_if_slow(what), starting, answer_kept(), handlers_kept():  # docs/reference/tasks.md promises it
         yield
 
 

@@ -1,7 +1,7 @@
 """Logging on stderr, one line an event: as text or as JSON.
 
 Text is short: the time of day, with the date in a day's first line, the level unless it is INFO, and who speaks. A
-record may carry named values (`log_event`): JSON includes them, text does not.
+record may carry named values (`log_event`): JSON includes them, text does not. Pages: monitor.md.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""The packages of this distribution and its extras, and the command that installs them."""
+"""The packages of this distribution and its extras, and the command that installs them. Pages: README.md."""
 
 import re
 import sys

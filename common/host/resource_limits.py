@@ -73,7 +73,7 @@ def _cpu_quota(folder: Path) -> float | None:
     return None
 
 
-WANTED_FILES = 65_536
+WANTED_FILES = 65_536  # docs/how-to/monitor.md describes this limit and the next one
 RESERVED_FILES = 64  # for everything but connections: journal, world model, controller, Zenoh's own
 
 

@@ -1,10 +1,10 @@
-"""When a process that drives episodes counts as hung: it made no step for too long."""
+"""When a process that drives episodes counts as hung: it made no step for too long. Pages: tasks.md, protocol.md."""
 
 from time import monotonic
 
-STALL_SECONDS = 30.0  # without a step, after which an episode is given up
+STALL_SECONDS = 30.0  # without a step, after which an episode is given up (docs/how-to/troubleshooting.md)
 FUNCTION_STALL_SECONDS = 600.0  # of one call of a function that is a task
-START_LIMIT = 120.0  # seconds that a process may take to load task and world model
+START_LIMIT = 120.0  # seconds that a process may take to load task and world model; task_check.py has it too
 
 
 class StallWatch:

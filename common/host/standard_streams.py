@@ -3,7 +3,7 @@
 Those of a long-lived process never block on a slow reader either. When a stopped terminal, a pager or a hanging log
 collector leaves its pipe full, a write to stderr blocks, and with it a loop, its signal handlers and every thread that
 logs. So a background thread writes. Its queue is bounded; further lines are dropped, and their number is written once
-the reader is back.
+the reader is back. Pages: monitor.md.
 """
 
 import atexit

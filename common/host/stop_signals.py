@@ -1,4 +1,4 @@
-"""Handling Ctrl-C and SIGTERM in long-running verbs: a clean stop, an interrupt, or a short delay."""
+"""Handling Ctrl-C and SIGTERM in long-running verbs: a clean stop, an interrupt, or a short delay. Pages: train.md."""
 
 import os
 import signal
@@ -14,7 +14,7 @@ from typing import Any
 from dreamfleet.common.errors import StoppedError
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-END_LIMIT = 4.0  # seconds that an orderly end may take after the second signal
+END_LIMIT = 4.0  # seconds that an orderly end may take after the second signal (docs/how-to/monitor.md)
 RETRY = 0.01  # seconds until a Ctrl-C that nobody could catch is sent again
 Stop = Callable[[], bool]
 """Returns whether to stop at the next point where that is safe."""
@@ -152,7 +152,7 @@ def call_on_signals(stop: Callable[[], None]) -> None:
             if heard.recv(1)[0] in SIGNALS:
                 received += 1
                 if received == 2:
-                    end_within(END_LIMIT, 1)
+                    end_within(END_LIMIT, 1)  # docs/reference/protocol.md says five seconds
                 stop()
 
     threading.Thread(target=listen, name="signals", daemon=True).start()

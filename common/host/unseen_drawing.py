@@ -27,7 +27,7 @@ def draw_offscreen() -> None:
     if sys.platform != "linux" or os.environ.get("DISPLAY"):
         return
     here = [name for name, module in MODULES.items() if find_spec(module) is not None]
-    users = os.environ.get(MUJOCO) or os.environ.get(OPENGL)
+    users = os.environ.get(MUJOCO) or os.environ.get(OPENGL)  # they count: docs/reference/tasks.md
     chosen = users or next((name for name, library in LIBRARIES.items() if here and _is_here(library)), "")
     values = {MUJOCO: chosen, OPENGL: chosen, PYGLET: "1" if chosen == "egl" else ""}
     for name in here:

@@ -2,7 +2,7 @@
 
 A process of dreamfleet has a command line of ours. A module that reads `sys.argv`, as with argparse at its top level,
 must not see that: it sees the arguments of the program that started the run, as with `multiprocessing`, else its own
-name alone.
+name alone. Pages: python.md.
 """
 
 import json

@@ -1,4 +1,7 @@
-"""The Zenoh protocol: keys, messages, their encoding and their bounds. Pages: protocol.md, glossary.md."""
+"""The Zenoh protocol: keys, messages, their encoding and bounds; tasks' names, measures, host classes, failures.
+
+Pages: protocol.md, glossary.md.
+"""
 
 __all__ = [
     "keys",

@@ -21,7 +21,7 @@ from dreamfleet.common.printable import plural
 from dreamfleet.common.schema.validation import OPTIONAL, Count, Text
 
 MAX_LISTED = 512  # batches in one reply
-MAX_BATCH = 32 << 20  # bytes of a body: 8 million numbers
+MAX_BATCH = 32 << 20  # bytes of a body: 8 million numbers; docs/how-to/ask-tell.md has these bounds
 MAX_CANDIDATES = 100_000  # of a batch
 MAX_SEEDS = 10_000  # episodes of a candidate
 MAX_EPISODES = 100_000  # of a batch: each is a job

@@ -1,4 +1,4 @@
-"""How much of a run was checked by other hosts, and what came of it."""
+"""How much of a run was checked by other hosts, and what came of it. Pages: status.md, trust.md."""
 
 from dataclasses import dataclass, field
 from typing import Annotated

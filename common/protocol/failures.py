@@ -1,4 +1,4 @@
-"""Why an attempt at a job failed, as data and in words; and what a job scores, in words."""
+"""Why an attempt at a job failed, as data and in words; and what a job scores, in words. Pages: troubleshooting.md."""
 
 from __future__ import annotations
 

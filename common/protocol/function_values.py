@@ -1,6 +1,6 @@
 """What people read of a function's run: its own values, where fitness is the negated value of one that is minimised.
 
-Journal, wire, JSON and tables for programs hold fitness; text, pictures and pages show values.
+Journal, wire, JSON and tables for programs hold fitness; text, pictures and pages show values. Pages: tasks.md.
 """
 
 import math
@@ -12,7 +12,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import is_function_task
 
-TWO_DECADES = 100
+TWO_DECADES = 100  # docs/tutorials/own-objective.md says when an axis is logarithmic
 
 
 def is_minimised(task: TaskSpec) -> bool:

@@ -1,7 +1,7 @@
 """Host classes: hosts of one class computed the same bits on fixed inputs. No input or output.
 
 A worker computes its class by scoring these inputs (`worker/scoring/host_class_probe.py`) and sends it with its
-results. For tasks without such inputs the class is derived from the host's fingerprint.
+results. For tasks without such inputs the class is derived from the host's fingerprint. Pages: determinism.md.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dreamfleet.common.schema.validation import Count, Text
 
 BY_FINGERPRINT = "fingerprint-"  # prefix of classes that are derived from a fingerprint
 NON_DETERMINISTIC = "non-deterministic"  # the class of a host where equal episodes gave other bits
-MAX_LISTED = 4  # classes in a status, and fingerprints of each class
+MAX_LISTED = 4  # classes in a status, and fingerprints of each class (docs/reference/metrics.md)
 MAX_FINGERPRINT_CHARS = 200  # of a fingerprint in a status
 
 ResultCounts = Mapping[tuple[str, str], int]
@@ -67,7 +67,7 @@ class HostClasses:
         return sum(each.results for each in self.largest if each.host_class == NON_DETERMINISTIC)
 
     @property
-    def description(self) -> str:
+    def description(self) -> str:  # docs/reference/status.md has these words
         """A text for display."""
         if not self.largest:
             return "no result yet"

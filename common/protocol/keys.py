@@ -1,4 +1,4 @@
-"""Zenoh keys of protocol version 2, and the names that they may contain."""
+"""Zenoh keys of protocol version 2, and the names that they may contain. Pages: upgrade.md."""
 
 import re
 import secrets

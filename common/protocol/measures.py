@@ -1,6 +1,6 @@
 """Measures: numbers that say how a candidate behaved, beside its fitness, and the axes of an archive of them.
 
-What a measure's name means stands in `docs/reference/optimisers.md`; `worker/tasks/measures.py` computes it.
+What a measure's name means stands in `docs/how-to/quality-diversity.md`; `worker/tasks/measures.py` computes it.
 """
 
 from __future__ import annotations

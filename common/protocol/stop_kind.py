@@ -1,4 +1,4 @@
-"""What pauses or ends a run, as a program reads it, and an end in words."""
+"""What pauses or ends a run, as a program reads it, and an end in words. Pages: status.md, python.md."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 A name is one that a package registers in the entry-point group `dreamfleet.tasks`; a registered family with an argument
 (`gym:LunarLander-v3`); or `module:attribute`, for an unregistered task. `gym:module:Environment-v0` and
 `function:module:name` name a module too.
-A name may come from a file or a message of somebody else, so only a trusted module is imported.
+A name may come from a file or a message of somebody else, so only a trusted module is imported. Pages: trust.md.
 """
 
 import re
@@ -26,7 +26,7 @@ _NAME = re.compile(r"[\w-][\w.-]*(:\S+)?", re.ASCII)
 _ENVIRONMENT = re.compile(r"-v\d+$", re.ASCII)  # as the names of gymnasium's environments end
 GYM = "gym"  # the family of gymnasium's environments; they need no bundle
 FUNCTION = "function"  # the family of Python functions of a vector
-ARGUMENTS = {GYM: "ENVIRONMENT", FUNCTION: "MODULE:NAME"}  # what stands behind a family's name
+ARGUMENTS = {GYM: "ENVIRONMENT", FUNCTION: "MODULE:NAME"}  # what stands behind a family's name: docs/reference/tasks.md
 DREAM = "dream"  # the task whose candidates are scored in the world model
 
 

@@ -1,4 +1,4 @@
-"""Runs on disk: their journals as typed records, schedules, provenance and evaluation reports.
+"""Runs on disk: their journals as typed records, schedules, seeds, provenance, evaluation reports, statistics.
 
 Pages: files.md, stages.md, stop-and-resume.md, settings.md.
 """

@@ -1,4 +1,4 @@
-"""Results of a controller on unseen seeds: one whole episode a seed, and their statistics."""
+"""Results of a controller on unseen seeds: one whole episode a seed, and their statistics. Pages: export.md."""
 
 from __future__ import annotations
 

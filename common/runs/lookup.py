@@ -177,7 +177,7 @@ def shipped_subspace_name(bundle: str) -> str | None:
 
 def find_subspace(name: str) -> Subspace:
     """A shipped subspace by name, or one by path; `UsageError` if there is none."""
-    folder = pretrained_folder() / SUBSPACES
+    folder = pretrained_folder() / SUBSPACES  # docs/reference/optimisers.md names them
     shipped = folder / f"{name}.npz"
     if is_file(shipped):
         return Subspace.load(shipped)

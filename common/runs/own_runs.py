@@ -20,7 +20,7 @@ def remember_run(uid: str, task: str, options: str) -> None:
     if not module or not is_trusted(module):
         return
     try:
-        path = own_runs_dir() / uid
+        path = own_runs_dir() / uid  # docs/how-to/trust.md says what follows
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         path.write_text(json.dumps([task, options, str(module_folder(module) or "")]))
     except (OSError, RuntimeError) as error:

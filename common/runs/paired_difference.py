@@ -1,4 +1,4 @@
-"""Comparison of two controllers on the seeds that both were evaluated on."""
+"""Comparison of two controllers on the seeds that both were evaluated on. Pages: export.md, protocol.md."""
 
 from __future__ import annotations
 

@@ -269,7 +269,7 @@ class StoredConfirmation:
     generation: int
     episodes: EpisodeCount
     mean: float
-    std: float  # of the sample: `episodes - 1` in the denominator
+    std: float  # of the sample: `episodes - 1` in the denominator (docs/how-to/export.md)
     closed: int  # generations closed before the choice, whose evaluated means it considered
     failed: Count = field(default=0, metadata=OPTIONAL)  # further episodes, which have no score
 

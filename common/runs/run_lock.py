@@ -1,4 +1,4 @@
-"""The lock on a run's folder: one process at a time writes, moves or deletes it."""
+"""The lock on a run's folder: one process at a time writes, moves or deletes it. Pages: troubleshooting.md."""
 
 import os
 from collections.abc import Iterator

@@ -1,6 +1,6 @@
 """The split of episode seeds, so that no controller is evaluated on a track that selected it.
 
-0-9999 unused; 10000-19999 test; 20000-999999 validation; training from 2**20 up.
+0-9999 unused; 10000-19999 test; 20000-999999 validation; training from 2**20 up. Pages: ask-tell.md, tasks.md.
 """
 
 import hashlib
@@ -15,7 +15,7 @@ CHOOSING_OFFSET, CONFIRMING_OFFSET = 10_000, 20_000
 TRAINING_FIRST = 2**20
 FOLDED_END = 2**31  # seeds below it fit into a signed number of 32 bits
 TRAINING_LAST = 2**53 - 1  # the largest integer that JSON represents exactly
-MAX_RESEEDS = 3  # times that a generation gets other seeds
+MAX_RESEEDS = 3  # times that a generation gets other seeds (docs/how-to/unattended.md)
 
 
 def training_seed(run_seed: int, generation: int, episode: int) -> int:

@@ -2,7 +2,7 @@
 
 A generation's stage, and so how its candidates are scored, is a pure function of the run's settings, of the generations
 before it, and of evaluations that are at least one interval old. So a run that is interrupted anywhere continues
-bit-identically.
+bit-identically. Pages: protocol.md.
 """
 
 import hashlib

@@ -29,7 +29,7 @@ def error_from_sample_std(std: float | None, count: int) -> float | None:
 
 def error_from_population_std(std: float, count: int) -> float | None:
     """Like `error_from_sample_std`, from a standard deviation with n in the denominator."""
-    return None if count < 2 else std / math.sqrt(count - 1)
+    return None if count < 2 else std / math.sqrt(count - 1)  # docs/how-to/export.md says which has n
 
 
 def score_digits(mean: float, error: float | None) -> int:

@@ -1,4 +1,4 @@
-"""How objects that users hold look: one line in a REPL, a small table in a notebook."""
+"""How objects that users hold look: one line in a REPL, a small table in a notebook. Pages: python.md."""
 
 from dataclasses import MISSING, fields
 from html import escape

@@ -23,7 +23,7 @@ from dreamfleet.common.printable import truncate
 Check = Callable[[Any], Any]
 T = TypeVar("T")
 MAX_TEXT = 2000  # characters: of an error, of why a worker is refused, of a fingerprint
-SCHEMA = "schema"  # the reason of whatever does not fit its type hints
+SCHEMA = "schema"  # the reason of whatever does not fit its type hints (docs/reference/status.md)
 MAX_SENTENCE = 200  # characters of why it does not: a peer may choose the name of a field
 OPTIONAL = {"optional": True}
 """`field(default=..., metadata=OPTIONAL)`: a missing field has its default, and a default is not written."""

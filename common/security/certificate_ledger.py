@@ -16,7 +16,7 @@ from dreamfleet.common.schema.validation import MalformedError, Moment, from_pla
 from dreamfleet.common.security.credentials import Credentials, identity, issue_command
 
 log = logging.getLogger(__name__)
-LEDGER_FILE = "issued.json"  # in the authority's folder
+LEDGER_FILE = "issued.json"  # in the authority's folder (docs/reference/files.md)
 MAX_BYTES = 4_000_000
 CHECK_INTERVAL = 2.0  # seconds between checks for changes
 

@@ -7,7 +7,7 @@ connections are unauthenticated, a socket filter makes the kernel drop packets o
 newcomer's kernel retries. Linux only: elsewhere there is no limit.
 
 It also closes connections of those that take part as routers without a router's or coordinator's seat, and lets nobody
-in for a while: between linked routers Zenoh would send others' messages through them.
+in for a while: between linked routers Zenoh would send others' messages through them. Pages: router.md.
 """
 
 import ctypes

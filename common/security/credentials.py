@@ -2,7 +2,7 @@
 
 A join file is TOML, mode 600, written by `dreamfleet access issue`. Role and seat form its identity at the router, such
 as `worker.17`: the certificate's common name, or the user name with passwords. Reading one does not need the extra
-`access`.
+`access`. Pages: files.md.
 """
 
 import hashlib

@@ -2,7 +2,7 @@
 
 Only the certificate says who a join file's holder is. Python's `ssl` reads one only as part of a handshake, so both of
 its ends are played in memory: this needs neither a network nor the extra `access`. Of a failed connection Zenoh reports
-only that it could not connect.
+only that it could not connect. Pages: troubleshooting.md.
 """
 
 import socket

@@ -1,6 +1,6 @@
 """The key by which a worker shows that it is on the coordinator's own host: a file that only their user can read.
 
-Hosts may share a home, and so the file: their keys differ by what each host knows of itself.
+Hosts may share a home, and so the file: their keys differ by what each host knows of itself. Pages: files.md, trust.md.
 """
 
 import hmac

@@ -1,4 +1,4 @@
-"""Network endpoints. Imports no transport library, so that every verb can import it quickly."""
+"""Network endpoints. Imports no transport library, so that every verb can import it quickly. Pages: monitor.md."""
 
 import re
 import socket
@@ -97,7 +97,7 @@ def is_loopback_host(host: str) -> bool:
 
 def names_loopback(host_header: str) -> bool:
     """Whether a request's `Host` header names the loopback: another site's name may resolve to it (DNS rebinding)."""
-    return bool(_LOOPBACK_HEADER.fullmatch(host_header))
+    return bool(_LOOPBACK_HEADER.fullmatch(host_header))  # docs/how-to/dashboard.md promises it
 
 
 def check_endpoint(endpoint: str) -> str:

@@ -59,7 +59,7 @@ class DemoPlan:
     quick_steps: int
     variant: str = ""  # of the run in reality: NAME=VALUE, or none
     judge: str  # what the outcome is judged in
-    tracks: int = 16  # unseen tracks or games that the outcome is judged on
+    tracks: int = 16  # unseen tracks or games that the outcome is judged on (docs/tutorials/first-drive.md)
     # Generations between evaluations, episodes of each, and of the confirmation: in the dream, and in reality.
     dream_evaluations: tuple[int, int, int] = (2, 8, 16)
     real_evaluations: tuple[int, int, int] = (3, 16, 64)

@@ -1,4 +1,4 @@
-"""What a scored seed is called in reports, a track or a game, and what a score counts."""
+"""What a scored seed is called in reports, a track or a game, and what a score counts. Pages: worlds.md."""
 
 from contextlib import suppress
 from pathlib import Path

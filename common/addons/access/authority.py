@@ -4,7 +4,7 @@
     secret           only with passwords: the secret that they are derived from
     issued.json      the list of issued and revoked join files; not secret
 
-Keys are P-256, which every TLS library supports; certificates are X.509 v3 (RFC 5280).
+Keys are P-256, which every TLS library supports; certificates are X.509 v3 (RFC 5280). Pages: files.md, fleet.md.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, MAX_BYTES
 from dreamfleet.common.security.credentials import SEATS, Credentials, derive_password, format_join_file, hash_authority
 
 AUTHORITY_DAYS = 3650  # validity of the authority's certificate
+# The help of verb.py's --days has these too.
 DEFAULT_DAYS = {"coordinator": 90, "router": 90, "operator": 90, "viewer": 90, "worker": 30}  # validity of join files
 CLOCK_SKEW = timedelta(minutes=5)  # certificates are valid from so long before their issue
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")  # in the certificate of every listener

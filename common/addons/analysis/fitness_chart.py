@@ -1,4 +1,7 @@
-"""Parts of charts that runs and trainings share: colours, and a run's fitness by generation."""
+"""Parts of charts that runs and trainings share: colours, and a run's fitness by generation.
+
+Pages: own-objective.md, python.md.
+"""
 
 from collections.abc import Iterable, Sequence
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""A run's learning curve: the scores of its evaluated means over the effort spent until then."""
+"""A run's learning curve: the scores of its evaluated means over the effort spent until then. Pages: python.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""A run's archive as its journal holds it, for people: elites by cell, in words, as tables and as a grid."""
+"""A run's archive as its journal holds it, for people: elites by cell, in words, as tables and as a grid.
+
+Pages: dashboard.md.
+"""
 
 import math
 from pathlib import Path

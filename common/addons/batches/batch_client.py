@@ -1,4 +1,7 @@
-"""Queries about batches over Zenoh: submit one in parts, read its scores page by page, cancel it. Thread-safe."""
+"""Queries about batches over Zenoh: submit one in parts, read its scores page by page, cancel it. Thread-safe.
+
+Pages: protocol.md.
+"""
 
 import queue
 from collections.abc import Callable, Sequence

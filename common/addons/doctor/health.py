@@ -1,4 +1,4 @@
-"""Checks of an installation, each with its remedy."""
+"""Checks of an installation, each with its remedy. Pages: monitor.md, back-up.md, security.md."""
 
 import shutil
 import tempfile

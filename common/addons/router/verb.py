@@ -1,4 +1,7 @@
-"""`dreamfleet router`: a meeting point, without state, for coordinators and workers that cannot reach each other."""
+"""`dreamfleet router`: a meeting point, without state, for coordinators and workers that cannot reach each other.
+
+Pages: monitor.md.
+"""
 
 import argparse
 import json

@@ -1,4 +1,7 @@
-"""The check of a task that needs no world model, before a run begins in it: two dry runs, each in a child process."""
+"""The check of a task that needs no world model, before a run begins in it: two dry runs, each in a child process.
+
+Pages: unattended.md, troubleshooting.md, determinism.md.
+"""
 
 import json
 import sys

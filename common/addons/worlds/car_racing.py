@@ -1,4 +1,4 @@
-"""CarRacing: presets of its runs, its published scores and its demonstration."""
+"""CarRacing: presets of its runs, its published scores and its demonstration. Pages: stages.md, watch.md, train.md."""
 
 from typing import Any
 

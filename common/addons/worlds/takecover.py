@@ -1,4 +1,4 @@
-"""Take Cover, ViZDoom's: its presets, its published score and its demonstration."""
+"""Take Cover, ViZDoom's: its presets, its published score and its demonstration. Pages: watch.md."""
 
 from typing import Any
 

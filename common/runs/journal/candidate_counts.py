@@ -1,4 +1,4 @@
-"""The episodes that each candidate's fitness is the mean of, with their effort."""
+"""The episodes that each candidate's fitness is the mean of, with their effort. Pages: protocol.md."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 

@@ -1,4 +1,4 @@
-"""The journal's tables. A journal of another schema version is refused and left as it is."""
+"""The journal's tables. A journal of another schema version is refused and left as it is. Pages: upgrade.md."""
 
 import sqlite3
 from contextlib import closing
