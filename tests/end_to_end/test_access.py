@@ -1,5 +1,6 @@
 """A fleet with join files: who is let in, who may do what, and that a run is none the worse for the others.
-Tests common/security/access_rules.py, common/addons/access/verb.py and coordinator/storage/kept_revocations.py."""
+Tests common/security/access_rules.py, common/addons/access/verb.py, coordinator/storage/kept_revocations.py,
+common/security/handshake.py and common/security/certificate_ledger.py."""
 
 import time
 from concurrent.futures import ThreadPoolExecutor

@@ -1,4 +1,5 @@
-"""Hosts that allow a process few open files, and readers that sleep: a pipe is full to the brim."""
+"""Hosts that allow a process few open files, and readers that sleep: a pipe is full to the brim.
+Tests common/host/resource_limits.py and common/host/standard_streams.py."""
 
 import os
 import shutil

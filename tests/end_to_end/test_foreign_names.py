@@ -1,4 +1,5 @@
-"""Files of other people name a module in every place that holds a name: no verb imports it unless the user named it."""
+"""Files of other people name a module in every place that holds a name: no verb imports it unless the user named it.
+Tests common/host/trusted_modules.py and common/protocol/tasks.py."""
 
 import json
 import os

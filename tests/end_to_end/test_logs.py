@@ -1,4 +1,5 @@
-"""What a coordinator and its workers say of one another. Tests coordinator/addons/runs/story_verb.py."""
+"""What a coordinator and its workers say of one another.
+Tests coordinator/addons/runs/story_verb.py and common/host/logs.py."""
 
 import json
 import os

@@ -1,5 +1,5 @@
 """A run that is continued: from its start, with what it had, by the words that it left, and on another host.
-Tests coordinator/settings/start.py."""
+Tests coordinator/settings/start.py and common/runs/run_paths.py."""
 
 import json
 import shutil

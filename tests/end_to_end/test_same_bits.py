@@ -1,4 +1,5 @@
-"""The promise: who scored, and who died meanwhile, changes no bit; a host of other bits is of another class."""
+"""The promise: who scored, and who died meanwhile, changes no bit; a host of other bits is of another class.
+Tests common/protocol/host_classes.py."""
 
 import os
 import signal

@@ -1,4 +1,5 @@
-"""A run of several stages with real workers: each is scored by its own settings, in a subspace, in dreams or driven."""
+"""A run of several stages with real workers: each is scored by its own settings, in a subspace, in dreams or driven.
+Tests common/runs/stages.py."""
 
 import json
 

@@ -1,4 +1,5 @@
-"""Runs whose controllers drive otherwise: each option is replayed to the bit, and every verb knows of it."""
+"""Runs whose controllers drive otherwise: each option is replayed to the bit, and every verb knows of it.
+Tests common/artifacts/car_racing_variants.py and common/artifacts/driving.py."""
 
 import json
 

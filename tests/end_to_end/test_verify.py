@@ -1,5 +1,6 @@
 """A share of the results is scored again on another host: who lies, or whose memory fails, is barred and recalled.
-Tests common/protocol/check_counts.py, coordinator/run/verification.py and coordinator/verbs/bar.py."""
+Tests common/protocol/check_counts.py, coordinator/run/verification.py, coordinator/verbs/bar.py and
+common/security/host_key.py."""
 
 import signal
 

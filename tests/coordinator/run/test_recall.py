@@ -1,4 +1,5 @@
-"""A run that is taken back to an earlier generation, in a real journal and with real optimisers."""
+"""A run that is taken back to an earlier generation, in a real journal and with real optimisers.
+Tests common/runs/journal/candidate_counts.py."""
 
 import sqlite3
 from contextlib import closing

@@ -1,4 +1,5 @@
-"""Tests config.py, freezing.py, limits.py, network.py, presets.py, resume_settings.py and common/cli/bounds.py."""
+"""Tests config.py, freezing.py, limits.py, network.py, presets.py, resume_settings.py, common/cli/bounds.py and
+common/addons/worlds/car_racing.py."""
 
 import json
 from contextlib import closing

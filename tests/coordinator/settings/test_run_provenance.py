@@ -1,5 +1,6 @@
 """The receipt in a reported controller: drawn up from the journal, and enough to begin the run again; a subspace;
-worlds that a bundle describes, of which this host has nothing. Tests dreamfleet/experiments/rerun.py."""
+worlds that a bundle describes, of which this host has nothing.
+Tests dreamfleet/experiments/rerun.py and common/addons/worlds/takecover.py."""
 
 import json
 import re

@@ -1,4 +1,5 @@
-"""Slots whose environments fork, crash, hang, or raise what nobody expects."""
+"""Slots whose environments fork, crash, hang, or raise what nobody expects.
+Tests common/host/child.py and common/host/descendants.py."""
 
 import os
 import queue

@@ -1,5 +1,6 @@
 """Slots, and scoring a group of jobs without a child process.
-Tests child.py, child_process.py, failure_log.py, job_group.py and slot.py."""
+Tests child.py, child_process.py, failure_log.py, job_group.py, slot.py, common/host/parent_death.py and
+common/host/stall_watch.py."""
 
 import hashlib
 import io

@@ -1,5 +1,5 @@
 """A variant's controllers follow their formula, repeat choices as configured, and give the same bits in any batch.
-Tests policy.py."""
+Tests policy.py and common/artifacts/world_driving.py."""
 
 from itertools import pairwise
 

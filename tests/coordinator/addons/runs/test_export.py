@@ -1,5 +1,6 @@
 """A run's journal as CSV, Parquet and TensorBoard's events, read back by those who read such files.
-Tests backup.py, stored_run.py and common/addons/analysis/scored_history.py."""
+Tests backup.py, stored_run.py, common/addons/analysis/scored_history.py and common/runs/journal/candidate_counts.py.
+"""
 
 import csv
 import json

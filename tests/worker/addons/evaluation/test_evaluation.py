@@ -1,5 +1,5 @@
 """Tests evaluation.py, evaluation_report.py, agents.py, predictor.py, verb.py,
-worker/addons/verification/report_verb.py and dreamfleet/experiments/controllers.py."""
+worker/addons/verification/report_verb.py, dreamfleet/experiments/controllers.py and common/host/process_pool.py."""
 
 import json
 import os

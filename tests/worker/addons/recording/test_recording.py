@@ -1,4 +1,5 @@
-"""Tests canvas.py, drive_frames.py, parallel_dream.py, recording.py, verb.py and video.py."""
+"""Tests canvas.py, drive_frames.py, parallel_dream.py, recording.py, verb.py, video.py and
+common/addons/worlds/takecover.py."""
 
 import json
 import re

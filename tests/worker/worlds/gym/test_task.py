@@ -1,5 +1,5 @@
 """Any gymnasium environment as a task, and with pictures as a world of data sets and world models.
-Tests environments.py, pixels.py, spaces.py and task.py."""
+Tests environments.py, pixels.py, spaces.py, task.py and common/host/foreign_code.py."""
 
 import json
 import re
