@@ -1,4 +1,4 @@
-"""The check of a new run's environment, before the run exists."""
+"""The check of a new run's environment, before the run exists. Pages: tasks.md, unattended.md."""
 
 import hashlib
 import json

@@ -1,6 +1,6 @@
 """Which worker gets which job: leases, credit, lost workers, speculative copies. Pure.
 
-Pages: protocol.md, decisions.md, unattended.md.
+Pages: protocol.md, decisions.md, unattended.md, status.md, troubleshooting.md.
 """
 
 __all__ = ["fleet", "member", "pending_jobs", "packing", "host_stats", "failures", "refusals", "event_log"]

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 from dreamfleet.common.client.status import EventKind
 from dreamfleet.common.protocol.messages import Job
 
-MAX_EVENTS = 32_768  # that are kept: a view copies their list in some 0.1 ms
+MAX_EVENTS = 32_768  # that are kept: a view copies their list in some 0.1 ms; docs/how-to/watch.md
 MAX_NAMED = 10_000  # jobs whose names are kept: many more than workers can hold
 
 

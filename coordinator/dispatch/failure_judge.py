@@ -7,7 +7,7 @@ from dreamfleet.coordinator.dispatch.failures import Attempt, host_of
 from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob, PendingJobs
 
-EQUAL_ATTEMPTS = 2  # that fail for one cause show that the episode fails
+EQUAL_ATTEMPTS = 2  # that fail for one cause show that the episode fails; docs/reference/python.md
 ANY_ATTEMPTS = 3  # that fail for several causes show it too
 HOST_ATTEMPTS = 10  # that a host's shortage ends, over about eight minutes: no host has what the episode needs
 PAUSING_ATTEMPTS = 3  # on the only worker

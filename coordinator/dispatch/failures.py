@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from dreamfleet.common.protocol.failures import Failure
 
 LONGEST_ERROR = 300  # characters of a worker's error that are shown
-LONGEST_PAUSE = 120.0  # seconds between two attempts
+LONGEST_PAUSE = 120.0  # seconds between two attempts; HOST_ATTEMPTS in failure_judge.py reckons with it
 WORKER_ENDED = Failure.of_host("its worker was lost")
 
 

@@ -1,7 +1,7 @@
 """The workers of a run and the jobs between them. Pure: events and a clock in, batches out.
 
 No message is trusted to arrive. A batch is kept until its worker confirms it, a job is wanted until its first valid
-result, and a job that heartbeats do not list is given again.
+result, and a job that heartbeats do not list is given again. Pages: fleet.md, threats.md.
 """
 
 from collections import Counter

@@ -1,7 +1,7 @@
 """What experience with a host says: how soon it returns jobs, how fast its link is, how long it stays up. Pure.
 
 R16: the coordinator measures a host before it relies on it. The record outlives a worker: the next worker of the same
-host starts with it.
+host starts with it. Pages: status.md, metrics.md.
 """
 
 from __future__ import annotations

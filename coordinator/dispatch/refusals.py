@@ -57,7 +57,7 @@ def find_refusal(
     return class_mismatch(admitted, host_class, request.fingerprint)
 
 
-def class_mismatch(run: str | None, host_class: str, fingerprint: str) -> Refusal:
+def class_mismatch(run: str | None, host_class: str, fingerprint: str) -> Refusal:  # docs/how-to/mixed-hosts.md
     """Why a strict run refuses a worker of another class, and the remedy."""
     own, other, host = (truncate(each or "", LONGEST) for each in (run, host_class, fingerprint))
     return Refusal(

@@ -19,7 +19,7 @@ QUIET_INTERVALS = 2  # heartbeat intervals without a message after which a holde
 UPLOAD_SECONDS = 30.0  # after its result, within which an upload should arrive
 MARGIN = 1.5  # a copy must be expected to finish this many times sooner
 # A job held longer than so many seconds and so many typical times may be copied, whatever progress its worker reports.
-LONGEST_HELD, LONGEST_HELD_TIMES = 60.0, 8.0
+LONGEST_HELD, LONGEST_HELD_TIMES = 60.0, 8.0  # docs/explanation/threats.md
 STALE, STALE_TIMES = 10.0, 20.0  # seconds, and turnarounds, after which a host's record is too old
 Straggler = tuple[float, bytes, Member]  # the seconds that a job's holder still needs, the job's digest, the holder
 

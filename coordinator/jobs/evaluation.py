@@ -115,7 +115,7 @@ class Evaluations:
         if len(each.scores) < len(each.digests):
             return None
         every = np.array([each.scores[digest] for digest in each.digests])
-        scores = every[np.isfinite(every)]
+        scores = every[np.isfinite(every)]  # docs/how-to/export.md
         failed = len(every) - len(scores)
         del self._open[generation]
         if not len(scores):
@@ -158,7 +158,7 @@ class Evaluations:
         """The finished evaluation of the highest rank; of equals the earliest."""
         return self._bests[-1] if self._bests else None
 
-    def have_fallen_behind(self, count: int, find_scores: FindScores) -> bool:
+    def have_fallen_behind(self, count: int, find_scores: FindScores) -> bool:  # docs/explanation/dreams.md
         """Whether each of the last `count` evaluations is clearly below the best one before them, paired by seed.
 
         This shows that the search exploits the dream: fitness in the dream rises while the real score falls.

@@ -13,7 +13,7 @@ from dreamfleet.coordinator.jobs.scoring_job import ScoringJob, make_jobs
 
 KnownResult = tuple[float, int, tuple[float, ...]]
 """Fitness, steps and measures of an episode, NaN for one that failed for good."""
-PART_JOBS = 16_384  # jobs that are made at a time, in some 60 ms
+PART_JOBS = 16_384  # jobs that are made at a time, in some 60 ms; docs/explanation/decisions.md
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ class Generation:
             fitness[~self._failed] = np.nanmean(np.where(self._counting, self._scores, np.nan)[~self._failed], axis=1)
         return fitness
 
-    def measures(self) -> NDArray[np.float64] | None:
+    def measures(self) -> NDArray[np.float64] | None:  # docs/how-to/quality-diversity.md
         """The measures of each candidate, `(population, measures)`: means over its wanted episodes, as the fitness.
 
         NaN where an episode failed; `None` if nothing is measured beside fitness.

@@ -81,7 +81,7 @@ class RolloutCollections:
         data = self.uploads.get_complete(worker, result.digest, result.upload)
         if data is None:
             return None
-        path = rollout_path(self._folder, work.job.generation, work.job.episode)
+        path = rollout_path(self._folder, work.job.generation, work.job.episode)  # docs/reference/files.md
         try:
             with atomic_write(path) as file:
                 file.write(data)

@@ -1,4 +1,4 @@
-"""Jobs, made from a parameter vector and seeds."""
+"""Jobs, made from a parameter vector and seeds. Pages: determinism.md."""
 
 import hashlib
 from collections.abc import Sequence

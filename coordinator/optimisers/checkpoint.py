@@ -20,7 +20,7 @@ _LIMITS = ArchiveLimits(1 << 30, members=4096)  # bytes: more than SQLite keeps 
 
 
 @dataclass(frozen=True)
-class Head:
+class Head:  # docs/explanation/decisions.md
     """The name and requirement of the optimiser that wrote a state, its mean `(dimension,)` and its step size.
 
     A search in a subspace also has an origin `(dimension,)`, the zero of its coordinates.

@@ -1,4 +1,4 @@
-"""CMA-ES by Hansen's own library, pycma, with a full or a diagonal covariance matrix."""
+"""CMA-ES by Hansen's own library, pycma, with a full or a diagonal covariance matrix. Pages: determinism.md."""
 
 import json
 import sys

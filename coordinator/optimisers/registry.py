@@ -1,4 +1,4 @@
-"""Optimisers by name: those registered under the entry-point group, and any as `module:attribute`."""
+"""Optimisers by name: those registered under the entry-point group, and any as `module:attribute`. Pages: trust.md."""
 
 import difflib
 import inspect

@@ -139,7 +139,7 @@ class WorkerAdmission:
         by_checks = {host: bar for host, bar in self.barred.items() if not bar.by_operator}
         self._barred_voters = {self._voter_of(host): bar for host, bar in by_checks.items()}
 
-    def _accepts_class(self, host_class: str) -> bool:
+    def _accepts_class(self, host_class: str) -> bool:  # docs/how-to/mixed-hosts.md
         return not self.strict or self.host_class in (None, host_class)
 
     def _enforce_class(self, member: Member) -> None:

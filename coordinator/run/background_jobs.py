@@ -136,7 +136,7 @@ class BackgroundJobs:
         if self._confirmation is not None:
             self._confirmation.record(job.digest, fitness)
 
-    def confirm(self) -> list[ScoringJob]:
+    def confirm(self) -> list[ScoringJob]:  # docs/explanation/dreams.md
         """The next jobs that confirm the reported mean; call it when a limit is reached and nothing is in progress.
 
         Empty once the mean is confirmed, or if nothing was evaluated; also while only checks are missing.

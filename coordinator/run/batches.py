@@ -38,7 +38,7 @@ from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.run.shown_state import shown_state
 from dreamfleet.coordinator.storage.batch_records import StoredBatch
 
-MAX_WAITING = 256  # batches
+MAX_WAITING = 256  # batches; docs/how-to/ask-tell.md
 MAX_WAITING_SIZE = 8 * MAX_BATCH  # bytes of their vectors
 PAGE_BYTES = 30_000  # of a reply's scores and errors
 LONGEST_ERROR = 300  # characters

@@ -1,4 +1,4 @@
-"""The generations of a run without a search of its own: each is a batch that somebody submitted."""
+"""The generations of a run without a search of its own: each is a batch that somebody submitted. Pages: ask-tell.md."""
 
 from typing import cast
 

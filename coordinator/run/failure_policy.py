@@ -1,4 +1,4 @@
-"""When failures pause a run (R8): too many candidates fail, or no host can score."""
+"""When failures pause a run (R8): too many candidates fail, or no host can score. Pages: unattended.md."""
 
 from contextlib import suppress
 

@@ -19,8 +19,8 @@ from dreamfleet.coordinator.optimisers.evolution import Evolution
 from dreamfleet.coordinator.settings.start import SUBSPACE_FACT, stored_start_mean, stored_subspace
 from dreamfleet.coordinator.storage.journal import Journal, StoredOpenGeneration
 
-MAX_REDRAWS = 3  # rounds in a generation; what fails after them ranks last
-RECENT = 5  # generations, the open one included, whose failures `--failure-limit` counts
+MAX_REDRAWS = 3  # rounds in a generation; what fails after them ranks last; docs/how-to/unattended.md
+RECENT = 5  # generations, the open one included, whose failures `--failure-limit` counts; settings/network.py
 
 
 class Generations:
@@ -176,7 +176,7 @@ class Generations:
         """Whether `try_again` would change the generation as its failures are now."""
         return self.can_reseed(generation) or (bool(generation.failed) and self._can_redraw)
 
-    def can_reseed(self, generation: Generation) -> bool:
+    def can_reseed(self, generation: Generation) -> bool:  # docs/how-to/troubleshooting.md
         """Whether `try_again` would give the generation other seeds.
 
         One call of a function for each candidate looks for no seed: other ones would fail alike.
@@ -271,7 +271,7 @@ def _ranked(fitness: NDArray[np.float64], worst: float) -> NDArray[np.float64]:
     return np.where(np.isfinite(fitness), fitness, np.nextafter(worst, -np.inf))
 
 
-def fitness_statistics(fitness: NDArray[np.float64]) -> dict[str, float]:
+def fitness_statistics(fitness: NDArray[np.float64]) -> dict[str, float]:  # docs/how-to/export.md
     """Mean, spread, best and worst of the candidates that have a fitness; 0 if none has one."""
     found = fitness[np.isfinite(fitness)]
     if not len(found):

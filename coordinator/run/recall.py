@@ -1,6 +1,6 @@
 """Rewinding a run: what barred hosts brought is taken back, and the run goes on from the first generation with any.
 
-A check finds a host wrong (R32), or the operator names it.
+A check finds a host wrong (R32), or the operator names it. Pages: decisions.md.
 """
 
 from collections.abc import Collection

@@ -50,7 +50,7 @@ class ReportedMean:
         )
 
 
-class ControllerWriter:
+class ControllerWriter:  # docs/explanation/decisions.md
     """Keeps the reported controller in the file at `path`; `receipt` builds its provenance at each save."""
 
     def __init__(self, path: Path, run_uid: str, settings: RunSettings, receipt: Callable[[], RunProvenance]) -> None:

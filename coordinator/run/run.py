@@ -38,7 +38,7 @@ from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.coordinator.storage.journal import Journal
 
 PAUSED = "paused"  # the fact that somebody paused the run
-BY_HAND = Pause(PauseKind.BY_HAND, "by hand")
+BY_HAND = Pause(PauseKind.BY_HAND, "by hand")  # docs/reference/status.md
 LONGEST_TICK = 2.0  # seconds between ticks; a longer gap means that this process was suspended
 WRITE_RETRY = 2.0  # seconds until a full disk or a locked journal is tried again
 
@@ -186,9 +186,9 @@ class Run:
             return False
         return True
 
-    def wait_until_writable(self, error: NotWritableNowError) -> None:
+    def wait_until_writable(self, error: NotWritableNowError) -> None:  # docs/how-to/unattended.md
         """Give out no jobs until what could not be written is written."""
-        why = f"{error}, and the run then continues by itself"
+        why = f"{error}, and the run then continues by itself"  # docs/how-to/troubleshooting.md
         if self.state.stalled is None:
             self.fleet.note(f"paused: {why}", "paused")
         self._enter(self.state.stall(why, self._now + WRITE_RETRY))

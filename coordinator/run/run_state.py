@@ -1,6 +1,6 @@
 """The state of a run and its named transitions: values that know no clock, no journal and no fleet.
 
-`docs/reference/protocol.md` draws them.
+`docs/reference/protocol.md` draws them. Pages: status.md, troubleshooting.md.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.run.run_state import Ended
 
-WAITS_FOR_WORKERS, WAITS_FOR_BATCH = "waiting for workers", "waiting for a batch"
+WAITS_FOR_WORKERS, WAITS_FOR_BATCH = "waiting for workers", "waiting for a batch"  # prometheus.py, status_panel.py
 
 
 class ShownState(NamedTuple):

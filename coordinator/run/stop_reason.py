@@ -1,4 +1,4 @@
-"""Why a run ends: its limits, or a search that has converged to one point."""
+"""Why a run ends: its limits, or a search that has converged to one point. Pages: status.md, troubleshooting.md."""
 
 import json
 from dataclasses import asdict

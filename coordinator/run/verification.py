@@ -3,7 +3,7 @@
 R32: which results are drawn follows from a secret of the run, so no worker can know. What is accepted does not depend
 on the draw. A generation, and an evaluation, waits for its checks as long as a host is here that can answer.
 `coordinator/jobs/checks.py` decides who is wrong, `recall.py` takes results back, and the simulation plays both with
-liars (`tests/simulation/test_liars.py`).
+liars (`tests/simulation/test_liars.py`). Pages: status.md, threats.md, decisions.md.
 """
 
 import hmac

@@ -1,6 +1,6 @@
 """The worker protocol of a run: messages become events of the run and its fleet, decisions become messages.
 
-No transport: the service decodes what arrives and sends what is returned.
+No transport: the service decodes what arrives and sends what is returned. Pages: threats.md.
 """
 
 from dataclasses import asdict

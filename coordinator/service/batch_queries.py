@@ -12,7 +12,7 @@ from dreamfleet.coordinator.run.batches import Batches
 PROGRESS_INTERVAL = 0.1  # seconds between two events about the open batch
 
 
-class BatchQueries:
+class BatchQueries:  # docs/how-to/ask-tell.md
     """Holds the replies of `batches` back until `send`."""
 
     def __init__(self, batches: Batches, name: str) -> None:

@@ -56,7 +56,7 @@ class Control:
         """
         self._now, self._host, verb = now, host, query_key.rsplit("/", 1)[-1]
         why, again = "", ""
-        if query_key != keys.control(self._name, verb):
+        if query_key != keys.control(self._name, verb):  # docs/explanation/threats.md
             why = f"one run is controlled at a time, by its own key: query {keys.control(self._name, 'VERB')}"
         elif verb not in self._verbs:
             known = ", ".join(self._verbs)

@@ -1,4 +1,4 @@
-"""Serve a run from a request: its folder, lock and journal, then the service."""
+"""Serve a run from a request: its folder, lock and journal, then the service. Pages: back-up.md, security.md."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def _serve_incarnation(request: RunRequest, stop: Stop, kept: _Kept) -> Run:
     if log_to := request.network.log_to:
         add_on("check-sinks")(log_to)
     settings, bundle, limit = _resolve_settings(request, folder)
-    if request.network.verify and settings.is_external:
+    if request.network.verify and settings.is_external:  # docs/how-to/trust.md
         raise UsageError(
             f"--verify: a run with --optimiser {settings.optimiser} hands its scores out as they come, so none can be "
             "taken back; leave it out"

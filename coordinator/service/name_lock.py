@@ -118,7 +118,7 @@ class NameLock:
             payload=None if own is None else encode_json(own), encoding="application/json",
         )  # fmt: skip
 
-    def _explain(self, other: ClaimNote | None) -> str:
+    def _explain(self, other: ClaimNote | None) -> str:  # docs/how-to/troubleshooting.md
         own = self._leader_check.own_note
         same = other is not None and own is not None and other.run_uid == own.run_uid
         who = "of another version" if other is None else f"in incarnation {other.incarnation}"

@@ -1,4 +1,4 @@
-"""What a coordinator logs about its run while it serves it."""
+"""What a coordinator logs about its run while it serves it. Pages: monitor.md, fleet.md, own-environment.md."""
 
 import logging
 import math

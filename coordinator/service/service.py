@@ -189,7 +189,7 @@ class Service:
             now = monotonic()
             self._run.tick(now)
             opened = self._run.advance(now)
-            if not self._run.state.is_rewound:  # jobs need not wait for the disk
+            if not self._run.state.is_rewound:  # jobs need not wait for the disk; docs/explanation/decisions.md
                 self._put(session, self._run.fleet.dispatch(now, durable=False))
             self._has_uncommitted = not (opened or self._is_commit_due(now))
             if self._has_uncommitted:
@@ -320,7 +320,7 @@ class Service:
     def _handle_worker_message(self, kind: str, sample: zenoh.Sample, now: float) -> None:
         worker = keys.worker_from_key(str(sample.key_expr))
         if self._is_revoked(worker):
-            self._inbox.dropped["revoked"] += 1
+            self._inbox.dropped["revoked"] += 1  # docs/explanation/threats.md
             return
         message: WorkerMessage | None = self._inbox.decode(_WORKER_MESSAGES[kind], sample.payload.to_bytes())
         if message is not None:
@@ -354,7 +354,7 @@ class Service:
         """Whether the certificate of a worker's seat, which its name ends in, was revoked."""
         return worker_seat_identity(worker) in self._revocations.revoked_seats
 
-    def _check_revocations(self, now: float) -> None:
+    def _check_revocations(self, now: float) -> None:  # docs/how-to/security.md
         """Remove workers whose certificates were revoked since the last look; `AccessError` if the own file ended."""
         before = self._revocations.revoked_seats
         self._revocations.reload_if_changed(now)

@@ -1,6 +1,6 @@
 """An immutable snapshot of a run: every answer about the run is cut from one, and no answer touches the run.
 
-Taking a snapshot costs the same however long the run is. Answers cut what may be long into pages.
+Taking a snapshot costs the same however long the run is. Answers cut what may be long into pages. Pages: decisions.md.
 """
 
 from __future__ import annotations

@@ -93,7 +93,7 @@ class RunConfig:
         RunSettings, 2, "episodes a candidate, on the same fresh seeds for all"
     )
     sigma0: float = frozen_option(RunSettings, 0.1, "first step size")
-    optimiser: str = frozen_option(
+    optimiser: str = frozen_option(  # docs/reference/optimisers.md
         RunSettings,
         "cma",
         "what proposes candidates: cma, cmaes-lra, cmaes-sep, openes, pepg, snes, xnes, of an archive cma-me and "
@@ -146,15 +146,15 @@ class RunConfig:
         "share of a candidate's episodes, 0 to 1, that is driven in the world that the others dream of; 1: all, as in "
         "a schedule whose first stage dreams",
     )
-    on_failure: OnFailure = frozen_option(
+    on_failure: OnFailure = frozen_option(  # docs/how-to/unattended.md
         RunSettings, "worst", "a candidate whose episode fails in two independent attempts: ranks last (worst), is "
         "drawn anew (redraw), or pauses the run (pause)",
     )  # fmt: skip
     seed: Count = frozen_option(RunSettings, 1, "makes the run: population and training seeds follow from it")
-    evaluate_every: Interval = frozen_option(
+    evaluate_every: Interval = frozen_option(  # docs/explanation/sources.md
         RunSettings, 25, "drive the mean in reality every so many generations; 0: never"
     )
-    evaluation_episodes: EpisodesPerCandidate = frozen_option(
+    evaluation_episodes: EpisodesPerCandidate = frozen_option(  # docs/tutorials/own-environment.md
         RunSettings, 100, "whole episodes of an evaluation, on validation seeds"
     )
     confirm_episodes: ConfirmationEpisodes | None = frozen_option(
@@ -204,7 +204,7 @@ class RunConfig:
         if self.optimiser == EXTERNAL:
             self._check_external()
 
-    def _check_external(self) -> None:
+    def _check_external(self) -> None:  # docs/how-to/ask-tell.md
         """`UsageError` for what only a run's own search can have."""
         given = {
             "--racing": self.racing,

@@ -22,7 +22,7 @@ from dreamfleet.coordinator.settings.start import (
 
 
 @dataclass(frozen=True)
-class Fork:
+class Fork:  # docs/how-to/stop-and-resume.md, docs/reference/optimisers.md
     """The settings that a run takes over from its source, and the mean that it begins at."""
 
     settings: dict[str, Any]

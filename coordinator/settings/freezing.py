@@ -69,7 +69,7 @@ def _fill_in(config: RunConfig, bundle: Bundle | None) -> RunConfig:
     if config.task is None and bundle is not None:
         config = replace(config, task=bundle.manifest.task)
     if config.task is not None and is_function_task(config.task):
-        return replace(config, horizon=1)
+        return replace(config, horizon=1)  # docs/reference/tasks.md
     if config.horizon is None:
         limit = DEFAULT_HORIZON if bundle is None else bundle.manifest.world.horizon
         return replace(config, horizon=min(limit, DEFAULT_HORIZON))
@@ -182,7 +182,7 @@ def check_normalisation(options: str, observations: int) -> None:
 
 def _check_subspace(subspace: Subspace, spec: TaskSpec, shape: ControllerShape, bundle: Bundle | None) -> None:
     """`UsageError` for a subspace of another world model, or of controllers with other inputs."""
-    if bundle is None or subspace.bundle not in bundle.same_models:
+    if bundle is None or subspace.bundle not in bundle.same_models:  # docs/reference/optimisers.md
         raise UsageError(
             f"--subspace (given, or the preset's) belongs to {describe_bundle(subspace.bundle)}, "
             f"the run uses {describe_bundle(spec.bundle)}: give its own --bundle, or --subspace {NO_SUBSPACE}"
@@ -199,7 +199,7 @@ def _try_optimiser(settings: RunSettings, stage: Stage, subspace: Subspace | Non
     from dreamfleet.coordinator.optimisers.evolution import Evolution  # heavy: `--help` reads this module too
 
     evolution = Evolution.of(settings, stage, subspace, None)
-    if settings.on_failure == "redraw":
+    if settings.on_failure == "redraw":  # docs/how-to/unattended.md
         if stage.settings.racing:
             raise UsageError("--on-failure redraw cannot be combined with --racing: a late candidate has no first half")
         evolution.check_redraws()

@@ -1,4 +1,4 @@
-"""When a run ends."""
+"""When a run ends. Pages: stop-and-resume.md."""
 
 import math
 from dataclasses import dataclass

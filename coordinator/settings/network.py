@@ -1,4 +1,4 @@
-"""Where a run is reached, and how it treats its workers."""
+"""Where a run is reached, and how it treats its workers. Pages: protocol.md, unattended.md, share-a-fleet.md."""
 
 from dataclasses import dataclass
 from typing import Annotated

@@ -1,7 +1,7 @@
 """How a run was last served, kept with it: a run that is continued has the same limits and the same network.
 
 Both are facts of the journal, as JSON of what differs from the defaults. What a flag, the file or the environment says
-when a run is continued is stronger, and is kept from then on.
+when a run is continued is stronger, and is kept from then on. Pages: stop-and-resume.md, configure.md, router.md.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Drawing up the receipt of a run's controller, from what its journal holds at that moment."""
+"""Drawing up the receipt of a run's controller, from what its journal holds at that moment. Pages: export.md."""
 
 import platform
 from functools import cache

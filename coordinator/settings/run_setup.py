@@ -1,4 +1,4 @@
-"""What a new run is and when it ends, from flags, environment and configuration file."""
+"""What a new run is and when it ends, from flags, environment and configuration file. Pages: ask-tell.md."""
 
 import argparse
 from dataclasses import replace

@@ -43,7 +43,7 @@ class StartPoint:
     source: str
     options: str = ""  # of the task, as its specification has them
     effort: Effort | None = None  # what was spent on it, where that is known
-    revoked: str | None = None  # the fact of its run's revoked seats
+    revoked: str | None = None  # the fact of its run's revoked seats; docs/how-to/security.md
 
     def apply_to(self, config: RunConfig) -> RunConfig:
         """The configuration with the options that this start was evolved under, where it does not name them.
@@ -110,7 +110,7 @@ def _describe_variant(variant: Variant) -> str:
     return f"with {variant.options}" if variant.options else "the plain way"
 
 
-def find_start(name: str, runs_dir: Path) -> StartPoint:
+def find_start(name: str, runs_dir: Path) -> StartPoint:  # docs/reference/python.md
     """A controller's file, a run (its reported controller, or its mean while it is open), or what ships."""
     if not is_file(Path(name)) and path_exists(runs_dir / name / JOURNAL):
         with open_run(runs_dir, name) as stored, stored.verified_transaction():

@@ -1,4 +1,4 @@
-"""The batches in a journal: what others submitted to a run without a search of its own."""
+"""The batches in a journal: what others submitted to a run without a search of its own. Pages: ask-tell.md."""
 
 import json
 from collections.abc import Mapping, Sequence

@@ -22,9 +22,9 @@ from dreamfleet.coordinator.storage.journal_file import sqlite_side_files
 from dreamfleet.coordinator.storage.served_bundle import ServedBundle
 
 log = logging.getLogger(__name__)
-CHECK_INTERVAL = 1.0  # seconds between two looks
+CHECK_INTERVAL = 1.0  # seconds between two looks; docs/reference/protocol.md
 SETTLE = 0.3  # seconds after which the removal of a folder is complete
-RESCUED = "rescued"
+RESCUED = "rescued"  # docs/how-to/troubleshooting.md
 
 Identity = tuple[int, int]
 

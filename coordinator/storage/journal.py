@@ -1,4 +1,4 @@
-"""The only writer of a run's journal: a result is on disk before the worker gets its verdict."""
+"""The only writer of a run's journal: a result is on disk before the worker gets its verdict. Pages: unattended.md."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from dreamfleet.common.printable import one_line
 REMEDIES = {
     sqlite3.SQLITE_FULL: "make room",
     sqlite3.SQLITE_BUSY: "end the program that keeps it locked",
-}  # of errors after which the same writes may succeed later
+}  # of errors after which the same writes may succeed later; docs/how-to/troubleshooting.md
 
 
 def check_database(connection: sqlite3.Connection) -> tuple[str, int | None]:

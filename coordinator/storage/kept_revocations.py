@@ -1,6 +1,6 @@
 """The revoked seats of a run's fleet, kept in its journal: they hold wherever and however the run is continued.
 
-A fact of the journal, as JSON: a list of seats for each authority, by the hash of its certificate.
+A fact of the journal, as JSON: a list of seats for each authority, by the hash of its certificate. Pages: security.md.
 """
 
 import json

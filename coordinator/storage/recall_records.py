@@ -1,4 +1,4 @@
-"""Removes results of barred hosts from a journal, and everything computed from them."""
+"""Removes results of barred hosts from a journal, and everything computed from them. Pages: trust.md, protocol.md."""
 
 import json
 from collections.abc import Collection, Iterable, Sequence

@@ -1,4 +1,4 @@
-"""The accepted results in a journal, by generation or by their jobs' digests, and their totals."""
+"""The accepted results in a journal, by generation or by their jobs' digests, and their totals. Pages: export.md."""
 
 import json
 from collections import Counter

@@ -19,7 +19,7 @@ class ServedBundle:
         """Release the file."""
         self._file.close()
 
-    def read_part(self, offset: int, length: int) -> tuple[int, int, bytes]:
+    def read_part(self, offset: int, length: int) -> tuple[int, int, bytes]:  # docs/reference/protocol.md
         """Where a part begins, how long the whole is, and the part: as much of what is asked for as there is."""
         total = os.fstat(self._file.fileno()).st_size
         offset = min(max(offset, 0), total)

@@ -14,7 +14,7 @@ from dreamfleet.coordinator.storage.journal_connection import JournalConnection
 from dreamfleet.coordinator.storage.result_records import ResultRecords
 
 VERIFY_KEY = "verify_key"  # the fact's name
-Outcome = Literal["equal", "differs", "unchecked"]
+Outcome = Literal["equal", "differs", "unchecked"]  # docs/reference/metrics.md, addons/metrics/prometheus.py
 UNCHECKED = "AND NOT EXISTS (SELECT 1 FROM verification WHERE verification.digest = result.digest AND stands)"
 
 

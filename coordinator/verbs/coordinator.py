@@ -1,4 +1,4 @@
-"""`dreamfleet coordinator`: start or continue a run."""
+"""`dreamfleet coordinator`: start or continue a run. Pages: exit-codes.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Searching the minimum or maximum of a Python function on a fleet, with restarts: each search is a run."""
+"""Searching the minimum or maximum of a Python function on a fleet, with restarts: each search is a run.
+
+Pages: own-objective.md.
+"""
 
 import math
 import warnings

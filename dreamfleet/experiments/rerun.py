@@ -1,4 +1,4 @@
-"""Re-run a run from the provenance in its controller."""
+"""Re-run a run from the provenance in its controller. Pages: determinism.md, export.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Short ones; `make chaos` is the long one."""
+"""Short ones; `make chaos` is the long one.
+
+Tests coordinator/dispatch/fleet.py, coordinator/run/run.py and coordinator/storage/journal.py.
+"""
 
 import pytest
 

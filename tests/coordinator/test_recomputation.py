@@ -1,6 +1,8 @@
 """A run's figures, computed again from its journal alone: by SQL, NumPy and pycma, and none of this program's code.
 
 The file is the second opinion. So formulas stand here once more, and only the run itself is started by the program.
+
+Tests coordinator/jobs/confirmation.py, coordinator/run/generations.py and coordinator/storage/result_records.py.
 """
 
 import csv

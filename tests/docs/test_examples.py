@@ -1,4 +1,8 @@
-"""The examples of docs/reference, docs/how-to and own_agent.py work as written, each in its own language."""
+"""The examples of docs/reference, docs/how-to and own_agent.py work as written, each in its own language.
+
+Tests coordinator/addons/runs/stored_run.py, dreamfleet/experiments/controllers.py, dreamfleet/experiments/minimise.py
+and dreamfleet/experiments/started_run.py.
+"""
 
 import re
 import shlex

@@ -1,4 +1,7 @@
-"""The tutorial's commands on three hosts, with its addresses: a worker is lost, then the coordinator, and no result."""
+"""The tutorial's commands on three hosts, with its addresses: a worker is lost, then the coordinator, and no result.
+
+Tests coordinator/dispatch/fleet.py, coordinator/dispatch/member.py and coordinator/service/run_log.py.
+"""
 
 import os
 import re

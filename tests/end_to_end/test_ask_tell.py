@@ -1,7 +1,7 @@
 """A search of somebody else's over a real fleet: batches over Zenoh, and what is killed amid one.
 
-Tests common/addons/batches/batch_client.py, common/addons/batches/remote_scorer.py and
-coordinator/service/batch_queries.py.
+Tests common/addons/batches/batch_client.py, common/addons/batches/remote_scorer.py,
+coordinator/service/batch_queries.py, coordinator/run/batches.py and coordinator/run/external_generations.py.
 """
 
 import numpy as np

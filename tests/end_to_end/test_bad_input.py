@@ -1,4 +1,8 @@
-"""What people get wrong: one clear line that says what to do, an exit code that is not 0, nothing lost."""
+"""What people get wrong: one clear line that says what to do, an exit code that is not 0, nothing lost.
+
+Tests coordinator/optimisers/registry.py, coordinator/settings/config.py, coordinator/settings/freezing.py and
+coordinator/settings/run_setup.py.
+"""
 
 import json
 import shutil

@@ -1,4 +1,7 @@
-"""The page's live view in a real browser: a process for what is watched, while somebody watches."""
+"""The page's live view in a real browser: a process for what is watched, while somebody watches.
+
+Tests coordinator/addons/dashboard/view_processes.py.
+"""
 
 import psutil
 import pytest

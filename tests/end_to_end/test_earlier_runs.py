@@ -3,7 +3,10 @@
 `tests/fixtures` holds their journals, the controllers that they reported, their world model, and what the version that
 wrote them gave when it continued them. CarRacing computes what it did when it was the only world:
 `tests/support/first_world.py` says what is compared, and writes the fixture.
-Tests common/runs/journal/schema.py and common/runs/records.py."""
+
+Tests common/runs/journal/schema.py, common/runs/records.py, coordinator/optimisers/checkpoint.py,
+coordinator/optimisers/pycma_state.py and coordinator/storage/journal.py.
+"""
 
 import json
 from pathlib import Path

@@ -1,5 +1,8 @@
 """A live run whose files are removed, replaced or moved: nothing is lost, it says so soon, and it can be continued.
-Tests coordinator/storage/file_watch.py and coordinator/storage/served_bundle.py."""
+
+Tests coordinator/storage/file_watch.py, coordinator/storage/served_bundle.py and
+coordinator/storage/journal_connection.py.
+"""
 
 import os
 import shlex

@@ -1,5 +1,7 @@
 """Files of other people name a module in every place that holds a name: no verb imports it unless the user named it.
-Tests common/host/trusted_modules.py and common/protocol/tasks.py."""
+
+Tests common/host/trusted_modules.py, common/protocol/tasks.py and coordinator/optimisers/registry.py.
+"""
 
 import json
 import os

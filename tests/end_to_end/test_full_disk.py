@@ -1,4 +1,8 @@
-"""A disk that fills up in the middle of a run."""
+"""A disk that fills up in the middle of a run.
+
+Tests coordinator/jobs/rollout_collection.py, coordinator/run/run.py, coordinator/storage/journal_connection.py and
+coordinator/storage/journal_file.py.
+"""
 
 import shutil
 import sqlite3

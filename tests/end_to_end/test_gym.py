@@ -1,4 +1,7 @@
-"""gymnasium's own environments and Take Cover on a fleet, without a bundle: learnt to the same bits by any."""
+"""gymnasium's own environments and Take Cover on a fleet, without a bundle: learnt to the same bits by any.
+
+Tests coordinator/addons/environment_check.py.
+"""
 
 import json
 

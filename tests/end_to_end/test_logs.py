@@ -1,5 +1,8 @@
 """What a coordinator and its workers say of one another.
-Tests coordinator/addons/runs/story_verb.py and common/host/logs.py."""
+
+Tests coordinator/addons/runs/story_verb.py, common/host/logs.py, coordinator/addons/sinks/live_log.py,
+coordinator/dispatch/event_log.py and coordinator/service/run_log.py.
+"""
 
 import json
 import os

@@ -1,5 +1,7 @@
 """A run that is continued: from its start, with what it had, by the words that it left, and on another host.
-Tests coordinator/settings/start.py and common/runs/run_paths.py."""
+
+Tests coordinator/settings/start.py, common/runs/run_paths.py and coordinator/settings/resume_settings.py.
+"""
 
 import json
 import shutil

@@ -1,6 +1,9 @@
 """A run with a task that scores in no time: what its coordinator, workers, status and journal do.
+
 Tests common/verbs/control.py, coordinator/service/main.py, coordinator/service/name_lock.py,
-coordinator/verbs/coordinator.py, coordinator/addons/quality_diversity/archive_plot.py and worker/verbs/worker.py."""
+coordinator/verbs/coordinator.py, coordinator/addons/quality_diversity/archive_plot.py, worker/verbs/worker.py,
+coordinator/jobs/evaluation.py and coordinator/settings/fork.py.
+"""
 
 import json
 import shutil

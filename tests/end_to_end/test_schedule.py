@@ -1,5 +1,8 @@
 """A run of several stages with real workers: each is scored by its own settings, in a subspace, in dreams or driven.
-Tests common/runs/stages.py."""
+
+Tests common/runs/stages.py, coordinator/run/generations.py, coordinator/settings/fork.py,
+coordinator/settings/stage_tables.py and coordinator/optimisers/evolution.py.
+"""
 
 import json
 

@@ -1,5 +1,8 @@
 """Watching a run from anywhere, to its end, and judging what it reports.
-Tests common/client/client.py, coordinator/addons/status/verb.py and coordinator/service/queryables.py."""
+
+Tests common/client/client.py, coordinator/addons/status/verb.py, coordinator/service/queryables.py and
+coordinator/addons/metrics/metrics_server.py.
+"""
 
 import json
 import os

@@ -1,6 +1,9 @@
 """A share of the results is scored again on another host: who lies, or whose memory fails, is barred and recalled.
-Tests common/protocol/check_counts.py, coordinator/run/verification.py, coordinator/verbs/bar.py and
-common/security/host_key.py."""
+
+Tests common/protocol/check_counts.py, coordinator/run/verification.py, coordinator/verbs/bar.py,
+common/security/host_key.py, coordinator/jobs/checks.py, coordinator/run/recall.py and
+coordinator/storage/verification_records.py.
+"""
 
 import signal
 

@@ -1,5 +1,8 @@
 """A run that a program starts: real coordinator and workers on this host, which end with it in every case.
-Tests dreamfleet/experiments/local/run_arguments.py and dreamfleet/experiments/local/kept_words.py."""
+
+Tests dreamfleet/experiments/local/run_arguments.py, dreamfleet/experiments/local/kept_words.py and
+dreamfleet/experiments/local/local_run.py.
+"""
 
 import os
 import shutil

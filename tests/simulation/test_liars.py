@@ -1,4 +1,7 @@
-"""Fleets with liars, by the virtual clock; `python -m tests.simulation.liars` measures many."""
+"""Fleets with liars, by the virtual clock; `python -m tests.simulation.liars` measures many.
+
+Tests coordinator/jobs/checks.py and coordinator/run/verification.py.
+"""
 
 from dataclasses import replace
 from unittest.mock import patch

@@ -1,4 +1,9 @@
-"""A few hundred schedules; `make simulate` plays a hundred thousand."""
+"""A few hundred schedules; `make simulate` plays a hundred thousand.
+
+Tests coordinator/dispatch/leases.py, coordinator/dispatch/member.py, coordinator/dispatch/packing.py,
+coordinator/dispatch/pending_jobs.py, coordinator/dispatch/speculative_execution.py and
+coordinator/run/worker_protocol.py.
+"""
 
 from dataclasses import replace
 

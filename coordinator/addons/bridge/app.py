@@ -35,7 +35,7 @@ from dreamfleet.coordinator.addons.web.documents import event, json_response
 from dreamfleet.coordinator.addons.web.guard import Guard
 
 MAX_BODY = 64 << 20  # bytes of a request
-MAX_TEXT = 16 << 20  # bytes of one whose vectors are numbers as text
+MAX_TEXT = 16 << 20  # bytes of one whose vectors are numbers as text; openapi.py says it too
 MANY = 1 << 16  # commas of such a one: in float32, only seeds are many
 MOST_DISCARDED = 1 << 30  # bytes of a request that is too long, which are read all the same
 MAX_BODIES = 4 * MAX_BODY  # bytes of all requests that are being read
@@ -46,6 +46,7 @@ KEEP_ALIVE = 10.0  # seconds between two signs of life in a stream of events
 RUN_WAIT = 600.0  # seconds for which a stream waits for a coordinator that does not answer
 OPEN_PATHS = ("/v1/health",)  # need no token
 POLL = 0.5  # seconds between two looks at a batch of which no event arrives
+# `openapi.py` says what each means.
 STATUS = {"malformed": 400, "too large": 413, "conflict": 409, "unknown": 404, "busy": 503, "not external": 409}
 Handler = Callable[[Request], Awaitable[Response]]
 

@@ -1,4 +1,4 @@
-"""Two stored runs compared for the page, by the functions of `dreamfleet compare`."""
+"""Two stored runs compared for the page, by the functions of `dreamfleet compare`. `page/compare.js` shows them."""
 
 from pathlib import Path
 from typing import Any

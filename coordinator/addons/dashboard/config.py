@@ -1,4 +1,4 @@
-"""The dashboard's settings: address, token and limits."""
+"""The dashboard's settings: address, token and limits. Pages: README.md."""
 
 from dataclasses import dataclass, field
 

@@ -1,4 +1,7 @@
-"""The columns that the charts plot for a run, live or stored: generations and evaluations. Pure."""
+"""The columns that the charts plot for a run, live or stored: generations and evaluations. Pure.
+
+`page/charts.js` draws them.
+"""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence

@@ -2,6 +2,8 @@
 
 The journal keeps no moment of a result, so a result counts evenly over the time in which its generation was scored. It
 keeps no number of slots either: what is known is the slot time of results, and how many workers were there.
+
+`page/hosts.js` shows it.
 """
 
 from bisect import bisect_left, bisect_right
@@ -19,7 +21,7 @@ BINS = 120  # of the run's time
 MOST_HOSTS = 200  # in the document; the others are summed
 MOST_EVENTS = 200  # the latest arrivals and departures
 Times = Mapping[int, tuple[float, float | None]]  # by generation: opened and closed
-_CAME, _GONE = ("joined", "back"), ("silent", "lost", "left")  # what becomes of a worker
+_CAME, _GONE = ("joined", "back"), ("silent", "lost", "left")  # what becomes of a worker: dispatch/event_log.py
 
 
 @dataclass

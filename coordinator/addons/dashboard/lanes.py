@@ -1,4 +1,7 @@
-"""What each worker did during the last minutes: one character a time slice, newest last. Pure."""
+"""What each worker did during the last minutes: one character a time slice, newest last. Pure.
+
+`page/live.js` shows it.
+"""
 
 from collections import deque
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""The JSON document that the page shows of a live run, apart from its curves. Pure."""
+"""The JSON document that the page shows of a live run, apart from its curves. Pure. `page/live.js` shows it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

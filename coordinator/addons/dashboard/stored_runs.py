@@ -1,4 +1,4 @@
-"""The runs on this disk for the page: a list, and details of one. Only reads journals."""
+"""The runs on this disk for the page: a list, and details of one. Only reads journals. `page/runs.js` shows them."""
 
 import time
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
 """Live views for the page: one `dreamfleet live` process for each target, shared by all its viewers.
 
 The dashboard's process has no simulator and no world model. A view's process starts with the first viewer and ends soon
-after the last one, so that workers publish frames only while somebody watches.
+after the last one, so that workers publish frames only while somebody watches. `page/view.js` shows them.
 """
 
 from __future__ import annotations

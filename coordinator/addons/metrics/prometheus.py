@@ -1,7 +1,7 @@
 """Run statuses as Prometheus's text, written by `prometheus_client`. No input or output.
 
 The number of series is bounded: only the first `MAX_WORKERS` workers have their own. Untrusted texts appear as label
-values only, shortened.
+values only, shortened. Pages: decisions.md.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,6 +20,7 @@ CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 MAX_WORKERS, MAX_REASONS = 200, 50
 OTHER_CLASSES = "other"  # label of the host classes that a status does not list
 MAX_LABEL_CHARS = 128
+# As `coordinator/run/shown_state.py` names them.
 STATES = ("running", "evaluating", "waiting for workers", "waiting for a batch", "paused", *FINAL_STATES)
 
 

@@ -25,7 +25,7 @@ from dreamfleet.common.schema.times import parse_time
 from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.coordinator.addons.runs.run_details import view_of
 
-AUTHORS = "The dreamfleet authors"
+AUTHORS = "The dreamfleet authors"  # as in CITATION.cff
 
 
 def citation_facts(run: RunFolder) -> dict[str, Any]:

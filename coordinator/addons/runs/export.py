@@ -1,4 +1,4 @@
-"""Export a run's journal as CSV, Parquet or TensorBoard events."""
+"""Export a run's journal as CSV, Parquet or TensorBoard events. Pages: monitor.md, python.md, quality-diversity.md."""
 
 import csv
 import io

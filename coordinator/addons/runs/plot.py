@@ -1,4 +1,7 @@
-"""Plots: one run's fitness over its generations, and learning curves of several runs over the effort spent."""
+"""Plots: one run's fitness over its generations, and learning curves of several runs over the effort spent.
+
+Pages: python.md, own-objective.md.
+"""
 
 import textwrap
 from collections.abc import Callable, Sequence

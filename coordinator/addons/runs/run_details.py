@@ -1,4 +1,7 @@
-"""A stored run in rows and facts, for people and for programs: what `runs list`, `runs show` and the page render."""
+"""A stored run in rows and facts, for people and for programs: what `runs list`, `runs show` and the page render.
+
+Pages: quality-diversity.md, own-objective.md, trust.md.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Processes beside the coordinator that write a run's curves to other programs while the run goes on.
 
 Each reads the journal, as any reader does, and writes what its record lacks. So it can stall nothing and misses
-nothing: a slow or absent server, or a kill, only delays steps.
+nothing: a slow or absent server, or a kill, only delays steps. Pages: decisions.md.
 """
 
 import logging

@@ -6,7 +6,7 @@ what is ours apart from what is not, `WorkerProcess` knows one worker, and each 
 
 A request is a line of JSON on stdin, followed by the files that it names. An answer is lines on stdout that begin with
 `MARK`: `say` or `line` as it works, then `ok` or `failed`. A lock keeps two commands from changing a host at the same
-time.
+time. Pages: files.md.
 """
 
 import errno

@@ -1,6 +1,6 @@
 """The steps on one host: connect, inspect, install, start, follow the log, end; and the forms of its agent's answers.
 
-A host that answers in another form fails alone.
+A host that answers in another form fails alone. Pages: upgrade.md.
 """
 
 import hashlib

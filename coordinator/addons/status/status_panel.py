@@ -1,4 +1,7 @@
-"""A run's status as a panel for a terminal of any size: the least important lines give way; no name is truncated."""
+"""A run's status as a panel for a terminal of any size: the least important lines give way; no name is truncated.
+
+Pages: security.md.
+"""
 
 import math
 import shlex

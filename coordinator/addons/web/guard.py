@@ -39,7 +39,7 @@ class Guard(ABC):
 
         await (self._refusal(scope, Headers(scope=scope)) or self._app)(scope, receive, with_headers)
 
-    def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
+    def _refusal(self, scope: Scope, headers: Headers) -> Response | None:  # bridge/openapi.py describes both
         if self._is_loopback and not names_loopback(headers.get("host", "")):
             return self.refuse(421, "misdirected", "ask for this address as http://127.0.0.1, with its port")
         # Browsers send Sec-Fetch headers (https://www.w3.org/TR/fetch-metadata/); other clients send none.

@@ -22,7 +22,7 @@ from dreamfleet.worker.training.stages.train import Model, TrainRequest
 
 GATE_SEED = VALIDATION.start + 30_000  # the first track of a gate: no evaluation and no confirmation has it
 GATE_NOISE = 0.3  # as in docs/lab/dreams-notes.md
-LATER_UPDATES = {VAE: 1800, MDNRNN: 600}  # default of a round that continues a model's training
+LATER_UPDATES = {VAE: 1800, MDNRNN: 600}  # default of a round that continues a model's training; config.py says it
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,7 @@
-"""A Python function by a name under which other processes find it: functions never travel as pickles."""
+"""A Python function by a name under which other processes find it: functions never travel as pickles.
+
+Pages: own-objective.md, tasks.md.
+"""
 
 import inspect
 import os

@@ -1,6 +1,9 @@
 """What evaluations get of a busy fleet, simulated: whole fleets, FIFO slots, no transport and no real time.
 
-Adding a bad worker never makes a run slower by more than 5 %, and long links leave no slot idle for long."""
+Adding a bad worker never makes a run slower by more than 5 %, and long links leave no slot idle for long.
+
+Tests host_stats.py, speculative_execution.py and worker_selection.py.
+"""
 
 import statistics
 from functools import cache

@@ -1,5 +1,8 @@
 """What failed attempts prove. R8: which worker gets a job that may have ended its workers, and how a new host shows
-that it can score. Tests failure_judge.py."""
+that it can score.
+
+Tests failure_judge.py, pending_jobs.py and worker_selection.py.
+"""
 
 import pytest
 

@@ -1,4 +1,7 @@
-"""No worker hoards what the run waits for: fleets of dream workers, one slot each, which dream `WIDTH` jobs at once."""
+"""No worker hoards what the run waits for: fleets of dream workers, one slot each, which dream `WIDTH` jobs at once.
+
+Tests member.py, speculative_execution.py and worker_selection.py.
+"""
 
 import pytest
 from msgspec.structs import replace

@@ -1,5 +1,7 @@
 """Candidates whose episodes fail wherever they are scored.
-Tests failure_policy.py and common/protocol/failures.py."""
+
+Tests failure_policy.py, common/protocol/failures.py and coordinator/dispatch/failure_judge.py.
+"""
 
 import itertools
 import json

@@ -1,5 +1,7 @@
 """A run that is taken back to an earlier generation, in a real journal and with real optimisers.
-Tests common/runs/journal/candidate_counts.py."""
+
+Tests common/runs/journal/candidate_counts.py, coordinator/storage/recall_records.py and verification.py.
+"""
 
 import sqlite3
 from contextlib import closing

@@ -1,9 +1,12 @@
 """A receipt and `runs show` say what is true of a run, and a receipt's commands run as they are printed.
 A function that is minimised has its own values. What runs learnt from what they spent, as data; their curves and
 fitness as pictures; what differs between them.
+
 Tests plot.py, run_details.py, verb.py, analysis_verb.py, common/protocol/function_values.py, common/runs/effort.py,
 common/addons/analysis/comparison.py, common/addons/analysis/fitness_chart.py, common/addons/analysis/learning.py,
-coordinator/addons/dashboard/compared_runs.py and dreamfleet/experiments/verbs/compare.py."""
+coordinator/addons/dashboard/compared_runs.py, dreamfleet/experiments/verbs/compare.py and
+coordinator/addons/runs/citation.py.
+"""
 
 import html
 import json
