@@ -1,4 +1,4 @@
-"""Which worker gets which job: leases, credit, lost workers, speculative copies. Pure.
+"""Which worker gets which job: leases, credit, lost workers, failed jobs, refusals, speculative copies. Pure.
 
 Pages: protocol.md, decisions.md, unattended.md, status.md, troubleshooting.md.
 """

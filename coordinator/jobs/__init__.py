@@ -1,4 +1,4 @@
-"""What a run scores: generations, evaluations, confirmations and kept rollouts, as jobs. Pure.
+"""What a run scores: generations, evaluations, confirmations and kept rollouts, as jobs; checks of them. Pure.
 
 Pages: protocol.md, stages.md, rounds.md.
 """

@@ -1,4 +1,4 @@
-"""The coordinator on Zenoh: name lock, inbound queue, status, metrics.
+"""The coordinator on Zenoh: name lock, inbound queue, status, control verbs, the log.
 
 Pages: protocol.md, status.md, stop-and-resume.md.
 """

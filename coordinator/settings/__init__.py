@@ -1,4 +1,4 @@
-"""What a run is: settings, presets, schedule, starting point, how it is resumed or rerun.
+"""What a run is: settings, presets, schedule, starting point, limits, network; how it is resumed or rerun.
 
 Pages: settings.md, presets.md, stages.md.
 """

@@ -1,4 +1,4 @@
-"""The run's journal, a copy of its database, and a watch over its files.
+"""The run's journal, a copy of its database, a watch over its files, and the world model that it serves.
 
 Pages: files.md, back-up.md, stop-and-resume.md.
 """
