@@ -1,4 +1,4 @@
-"""The worker's own checks for `dreamfleet doctor`."""
+"""The worker's own checks for `dreamfleet doctor`. Pages: first-drive.md, troubleshooting.md."""
 
 from collections.abc import Iterator
 

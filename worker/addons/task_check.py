@@ -2,7 +2,7 @@
 
 `common/addons/task_check/task_check.py` starts it, because an environment may hang or crash. It reads a request
 from stdin and writes lines of JSON: a step's name before each step, to which a limit applies, and reports, of which
-the last counts.
+the last counts. Pages: tasks.md, own-environment.md, unattended.md.
 """
 
 import json

@@ -20,14 +20,14 @@ from dreamfleet.worker.tasks.measures import Measurer
 from dreamfleet.worker.tasks.watching import StepObserver, StepSnapshot
 
 DEFAULT_TEMPERATURE = 1.0
-MAX_ROWS = 256  # episodes that are dreamt together: larger batches are slower
+MAX_ROWS = 256  # episodes that are dreamt together: larger batches are slower (docs/explanation/decisions.md)
 TORCH_ROWS = 512  # on a torch device: half of what a worker may hold, so that the next are there when these are over
 
 
 class DreamBatch:
     """Scores batches of dreamt episodes."""
 
-    most_rows = MAX_ROWS
+    most_rows = MAX_ROWS  # on a torch device TORCH_ROWS: docs/how-to/gpu.md
 
     def __init__(self, bundle: Bundle, spec: TaskSpec) -> None:
         self._size = bundle.controller_shape.size

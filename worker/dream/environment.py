@@ -1,6 +1,6 @@
 """The dream as gymnasium environments, single and vectorised. They observe latents; the decoder renders them.
 
-For CarRacing, the environment of `car_racing.latent` has the same observations in reality.
+For CarRacing, the environment of `car_racing.latent` has the same observations in reality. Pages: python.md.
 """
 
 from __future__ import annotations

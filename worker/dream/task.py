@@ -1,4 +1,4 @@
-"""The dream as a task: candidates are scored in it, many at once; reported scores come from reality."""
+"""The dream as a task: candidates are scored in it, many at once; reported scores come from reality. Pages: gpu.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How many drives a slot does side by side. Pure."""
+"""How many drives a slot does side by side. Pure. Pages: tasks.md, decisions.md."""
 
 import statistics
 from collections import deque

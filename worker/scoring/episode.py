@@ -1,4 +1,4 @@
-"""The episode loop, which scoring, evaluating, recording, collecting and inspecting share."""
+"""The episode loop, which scoring, evaluating, recording, collecting and inspecting share. Pages: tasks.md."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence

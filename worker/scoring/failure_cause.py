@@ -16,7 +16,7 @@ NO_ROOM = (
 )  # fmt: skip
 
 
-def is_hosts_fault(cause: BaseException | int) -> bool:
+def is_hosts_fault(cause: BaseException | int) -> bool:  # docs/how-to/unattended.md
     """Whether the host is at fault and not the candidate; `cause` is an exception, or a child's exit status.
 
     R8: no memory, a disk that is full, read-only or broken, no descriptor, process or thread left, and a SIGKILL that
@@ -58,7 +58,7 @@ def crash(reason: int | str) -> Failure:
     if isinstance(reason, int) and is_hosts_fault(reason):
         return Failure.of_host(f"{describe_exit(reason)}, as the kernel does when memory is short")
     words = reason if isinstance(reason, str) else describe_exit(reason)
-    return Failure(f"slot crashed ({words})", words[:MAX_CAUSE], kind="crash")
+    return Failure(f"slot crashed ({words})", words[:MAX_CAUSE], kind="crash")  # docs/how-to/troubleshooting.md
 
 
 def encodable(text: str) -> str:

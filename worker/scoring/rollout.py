@@ -71,7 +71,7 @@ class Rollout:
 
         `terminal` is there only where it differs from `ended`.
         """
-        arrays: dict[str, NDArray[Any]] = {
+        arrays: dict[str, NDArray[Any]] = {  # docs/reference/files.md
             "picture": np.stack(self._pictures),
             "action": np.stack(self._actions),
             "reward": np.array(self._rewards, dtype=np.float32),

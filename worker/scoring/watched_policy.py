@@ -17,7 +17,7 @@ from dreamfleet.worker.tasks.watching import StepObserver, StepSnapshot
 Picture = NDArray[np.uint8]
 
 
-class WatchedPolicy:
+class WatchedPolicy:  # docs/how-to/watch.md
     """Wraps a policy and passes some of its steps to an observer; the actions are the policy's own."""
 
     def __init__(

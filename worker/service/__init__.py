@@ -1,6 +1,6 @@
 """The worker service: it joins a run, scores jobs, and delivers each result until it is acknowledged.
 
-Pages: protocol.md, hosts.md, unattended.md, mixed-hosts.md.
+Slots are shared by runs, and live frames go to viewers. Pages: protocol.md, hosts.md, unattended.md, mixed-hosts.md.
 """
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Joining a run: the hello request and its answer."""
+"""Joining a run: the hello request and its answer. Pages: threats.md, share-a-fleet.md."""
 
 import json
 import math

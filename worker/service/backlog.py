@@ -1,6 +1,6 @@
 """The jobs that the coordinator has given this worker and that no slot has taken yet. Pure.
 
-Batches may arrive twice, late or out of order, and anybody on the network can send some.
+Batches may arrive twice, late or out of order, and anybody on the network can send some. Pages: threats.md.
 """
 
 import hashlib

@@ -1,7 +1,7 @@
 """Fetch the frozen world model by its hash: in parts, resumable, verified.
 
 Anybody on the network can answer. So all parts of a download come from one source, and a source whose bytes had another
-hash is used again only if nobody else answers.
+hash is used again only if nobody else answers. Pages: threats.md, troubleshooting.md.
 """
 
 import logging

@@ -1,4 +1,4 @@
-"""A scoring child process as its parent handles it."""
+"""A scoring child process as its parent handles it. Pages: monitor.md."""
 
 import logging
 import math

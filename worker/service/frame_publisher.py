@@ -1,7 +1,7 @@
 """Publishing live frames of a run while somebody watches.
 
 Frames have the lowest priority and are dropped where a link is busy, so no job, result or heartbeat waits for a slow
-viewer. The expensive work, decoding and dreaming, is done by the viewer.
+viewer. The expensive work, decoding and dreaming, is done by the viewer. Pages: watch.md.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,7 @@
 """Sampling frames of a running episode in a scoring child while somebody watches.
 
 An episode runs many times faster than real time, so a viewer gets samples: ten frames a second, and fewer where a frame
-is expensive. Sampling never takes more than a hundredth of the child's time.
+is expensive. Sampling never takes more than a hundredth of the child's time. Pages: watch.md, dashboard.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Whether a worker belongs to its run, must say hello again, or leaves. Pure: events and times in, decisions out.
 
 A coordinator forgets a worker whose liveliness token vanishes. A cut connection makes the token of each side vanish for
-the other, and neither side can reliably notify the other afterwards.
+the other, and neither side can reliably notify the other afterwards. Pages: share-a-fleet.md, exit-codes.md.
 """
 
 import math

@@ -101,7 +101,7 @@ class RunSession:
             session.liveliness().declare_token(keys.live_worker(run, self._link.identity)),
             self._frame_publisher,
         ]
-        device = f", dreams on {self._slots.torch_device}" if self._slots.torch_device else ""
+        device = f", dreams on {self._slots.torch_device}" if self._slots.torch_device else ""  # docs/how-to/gpu.md
         text = f"joined run {run} as {self._link.identity}, {plural(len(self._slots), 'slot')}{device}"
         log_event(log, "joined", text, run=run, worker=self._link.identity)
         self._note_version()
@@ -194,7 +194,7 @@ class RunSession:
     def _say_waiting(self) -> None:
         """Log once that no coordinator is in sight. One that was killed as this worker joined was never in sight."""
         if not self._said_waiting:
-            self._said_waiting = True
+            self._said_waiting = True  # docs/how-to/monitor.md says what is logged
             run, plan = self._admission.run, self._membership.plan_without_coordinator
             text = f"the coordinator of run {run} left or cannot be reached; this worker {plan}"
             log_event(log, "coordinator gone", text, run=run)
@@ -307,7 +307,7 @@ class RunSession:
         """Log once for each version of the coordinator that it is not this worker's."""
         run, version, own = self._admission.run, self._admission.package, package_version("dreamfleet")
         if version not in (own, self._coordinator_version):
-            these = f"run {run} is of dreamfleet {version}, and this worker of {own}"
+            these = f"run {run} is of dreamfleet {version}, and this worker of {own}"  # docs/how-to/upgrade.md
             text = f"{these}: install {version} here and start the worker again"
             log_event(log, "other version", text, level=logging.WARNING, run=run, package=version)
         self._coordinator_version = version

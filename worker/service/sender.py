@@ -1,4 +1,4 @@
-"""Messages from a worker to the coordinator of its run."""
+"""Messages from a worker to the coordinator of its run. Pages: status.md."""
 
 import os
 from collections.abc import Callable, Sequence

@@ -21,7 +21,7 @@ from dreamfleet.worker.service.frame_sampler import SampledFrame
 from dreamfleet.worker.service.job_group import GroupDone, JobGroup, JobWithVector, describe_jobs
 
 log = logging.getLogger(__name__)
-FAILED_STARTS = 3  # failed starts in a row that end the worker
+FAILED_STARTS = 3  # failed starts in a row that end the worker (docs/how-to/monitor.md)
 STARVED_STARTS = 15  # the same where the host is at fault; the pauses between them add up to 602 seconds
 START_RETRY_DELAY = 2.0  # seconds until the next try, where no child could be started; doubled where the host is short
 MAX_STARVED_DELAY = 60.0  # the longest of these pauses
@@ -256,7 +256,7 @@ class Slot:
         self.stop()
         self.start()
 
-    def _replace_child(self) -> tuple[Result, ...]:
+    def _replace_child(self) -> tuple[Result, ...]:  # docs/how-to/troubleshooting.md quotes its warning
         """Replace a child that is gone; return errors for the jobs that it was scoring, if it was fresh.
 
         R8: a crash is an error of these jobs, which other workers then try, and never a fitness. If the child was not
@@ -347,5 +347,5 @@ class Slot:
                 self._groups.popleft()
 
 
-def _cannot_start(reason: str) -> DreamfleetError:
+def _cannot_start(reason: str) -> DreamfleetError:  # docs/reference/exit-codes.md
     return DreamfleetError(f"a slot cannot start: {reason}; `dreamfleet doctor` looks for the cause")

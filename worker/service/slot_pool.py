@@ -1,4 +1,4 @@
-"""All scoring slots of a worker."""
+"""All scoring slots of a worker. Pages: share-a-fleet.md, gpu.md."""
 
 import logging
 import math

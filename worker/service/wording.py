@@ -68,7 +68,7 @@ class WaitingText:
             awaited = (f"run {self._run}" if self._run else "a run") if answered else "a coordinator"
             names = join_some([each for each in others() if each != self._run], SHOWN_RUNS) if answered else ""
             there = f"; what is served there: {names}" if names else ""
-            return f"waiting for {awaited} at {address}{there}"
+            return f"waiting for {awaited} at {address}{there}"  # docs/how-to/troubleshooting.md
         if self.ended or self._has_named_remedy or now - self._since < WAIT_LIMIT:
             return ""
         self._has_named_remedy = True

@@ -94,7 +94,7 @@ class Worker:
         self.inbox = CountingDecoder()
         self._config = config
         self._network = network
-        self._slot_count = config.slots or (1 if config.torch_device else usable_cores())
+        self._slot_count = config.slots or (1 if config.torch_device else usable_cores())  # docs/how-to/gpu.md
         self._hello = make_request(
             self.identity, (*known_tasks(), *tasks), self._slot_count, torch_device=config.torch_device
         )
@@ -134,7 +134,7 @@ class Worker:
                 "worker with that"
             )
 
-    def _join_file_ends(self) -> bool:
+    def _join_file_ends(self) -> bool:  # docs/how-to/security.md
         """Whether it must drain, because links are closed when the join file expires."""
         credentials = self._network.credentials
         return credentials is not None and credentials.time_left.total_seconds() <= self._config.drain_timeout
@@ -162,7 +162,7 @@ class Worker:
             self._pause()
         return None
 
-    def _check_waiting_time(self, why: str = "") -> None:
+    def _check_waiting_time(self, why: str = "") -> None:  # docs/reference/exit-codes.md
         """`ConnectionFailedError` if it leaves with its run, and no coordinator let it in for too long; `why` if known.
 
         R24: such a worker ends by itself, also where its run ended before it came.

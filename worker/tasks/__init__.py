@@ -1,6 +1,6 @@
 """Tasks: the contract between an environment, a policy and the rest of the system, and finding tasks by name.
 
-Pages: tasks.md, python.md.
+Also what many tasks use: pictures, drivers, measures, resets. Pages: tasks.md, python.md.
 """
 
 __all__ = [

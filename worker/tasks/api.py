@@ -2,7 +2,7 @@
 
 A package with a task needs only this module; docs/reference/tasks.md has an example. The dream, the real track and any
 gymnasium environment satisfy the same contract. What a task may have beyond it has a file each: `batches.py`,
-`side_by_side.py`, `recordable.py`, `true_state.py`.
+`side_by_side.py`, `recordable.py`, `true_state.py`. Pages: determinism.md, protocol.md.
 """
 
 from __future__ import annotations

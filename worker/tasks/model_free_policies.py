@@ -36,7 +36,7 @@ class FlatPolicy:
         """The action for an observation of any shape."""
         return self._actions.to_action(self.outputs(observation))
 
-    def outputs(self, observation: Any) -> Floats:
+    def outputs(self, observation: Any) -> Floats:  # worker/worlds/gym/standalone_play.py computes the same
         """The controller's outputs `(outputs,)` for an observation; the action is made of them."""
         value = (np.asarray(observation, dtype=np.float32).reshape(-1) - self._mean) * self._scale
         *before, (weights, biases) = self._layers

@@ -1,7 +1,7 @@
 """Pictures of any environment for world models: an exact resize, and wrappers that make one kind of environment of all.
 
 A recordable task chains them in the order in which they stand here. What is left observes uint8 pictures
-`(size, size, 3)` and takes float32 actions `(A,)`.
+`(size, size, 3)` and takes float32 actions `(A,)`. Pages: worlds.md, own-world-model.md.
 """
 
 import math

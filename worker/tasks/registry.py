@@ -19,7 +19,7 @@ from dreamfleet.worker.tasks.recordable import Preprocessing, RecordableTask, Ta
 REQUIRED_METHODS = ("make_environment", "make_evaluation_environment", "make_policy", "world_of")
 
 
-def check_task_allowed(task: str, allowed_tasks: Collection[str]) -> None:
+def check_task_allowed(task: str, allowed_tasks: Collection[str]) -> None:  # docs/how-to/trust.md
     """`RefusedError` unless this worker announced the task or its family."""
     if family_of(task) not in allowed_tasks:
         raise RefusedError(
@@ -34,7 +34,7 @@ def check_world_allowed(bundle: Bundle, allowed_tasks: Collection[str]) -> None:
         check_task_allowed(bundle.manifest.task, allowed_tasks)
 
 
-def known_tasks() -> tuple[str, ...]:
+def known_tasks() -> tuple[str, ...]:  # docs/reference/protocol.md
     """Names of the registered tasks and families."""
     return tuple(registered_tasks())
 

@@ -13,7 +13,7 @@ Truth = Callable[[gymnasium.Env[Any, Any]], dict[str, float]]
 
 
 @runtime_checkable
-class TaskWithTrueState(Protocol):
+class TaskWithTrueState(Protocol):  # docs/reference/worlds.md
     """A task whose worlds report their true state.
 
     `dreamfleet inspect` measures world models against it, and `dreamfleet evaluate` reports how a controller drove.

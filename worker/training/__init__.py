@@ -1,6 +1,6 @@
 """From nothing to a bundle: collect, train the VAE, encode, train the MDN-RNN, bundle.
 
-Pages: train.md, presets.md, own-world-model.md.
+Pages: train.md, presets.md, own-world-model.md, files.md.
 """
 
 __all__ = [

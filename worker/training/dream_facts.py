@@ -1,4 +1,4 @@
-"""What a bundle says of dreams in its world: where their rewards come from, and when they end."""
+"""What a bundle says of dreams in its world: where their rewards come from, and when they end. Pages: worlds.md."""
 
 from __future__ import annotations
 

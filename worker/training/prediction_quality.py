@@ -76,7 +76,7 @@ def end_quality(model: MDNRNN, held_out: Sequence[Path]) -> dict[str, float]:
                     found.append(part[rollouts.mask > 0].cpu().numpy())
     probability = calibrate_end(np.concatenate(predicted).astype(np.float64), model.config.done_weight)
     label = np.concatenate(ended)
-    figures = {"done_brier": float(np.square(probability - label).mean())}
+    figures = {"done_brier": float(np.square(probability - label).mean())}  # page_builder.py has their units
     if label.any():
         figures["done_calibration"] = float(probability.mean() / label.mean())
     return {name: float(f"{value:.4g}") for name, value in figures.items()}

@@ -1,4 +1,4 @@
-"""Train the MDN-RNN on encoded rollouts."""
+"""Train the MDN-RNN on encoded rollouts. Pages: sources.md."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -23,7 +23,7 @@ from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, binary_loss, latent_loss
 from dreamfleet.worker.worldmodel.mdnrnn_config import ADDABLE_HEADS, REWARDED, MDNRNNConfig
 
 N = TypeVar("N", float, Tensor)
-CHECKPOINT, CURVE = "mdnrnn.safetensors", "mdnrnn.jsonl"
+CHECKPOINT, CURVE = "mdnrnn.safetensors", "mdnrnn.jsonl"  # also in addons/inspection/training_curves.py
 VALIDATION_ROLLOUTS = 20  # for the curve while training
 
 

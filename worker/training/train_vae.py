@@ -20,7 +20,7 @@ from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
 
 log = logging.getLogger(__name__)
 
-CHECKPOINT, CURVE = "vae.safetensors", "vae.jsonl"
+CHECKPOINT, CURVE = "vae.safetensors", "vae.jsonl"  # also in addons/inspection: vae_sections.py, training_curves.py
 VALIDATION_PICTURES = 2000
 CURVE_PICTURES = 500  # of them, for the curve during training
 MEAN_EPISODES = 48  # first ones to train on, of which the mean picture is

@@ -64,7 +64,7 @@ class TrainingState:
         """Whether no more updates are to be made."""
         return self.update >= self._config.updates or self.progress.get("stopped") is not None
 
-    def should_continue(self, stop: Stop) -> bool:
+    def should_continue(self, stop: Stop) -> bool:  # docs/explanation/determinism.md
         """Whether to make another update; if `stop` asks for a stop, save and raise `StoppedError`.
 
         It stops between updates only, so that a resumed training gives the same weights as an uninterrupted one.
@@ -183,7 +183,7 @@ def count_parameters(model: torch.nn.Module) -> int:
     return sum(each.numel() for each in model.parameters() if each.requires_grad)
 
 
-def disable_triton_after_mesa(maps: Path = Path("/proc/self/maps")) -> None:
+def disable_triton_after_mesa(maps: Path = Path("/proc/self/maps")) -> None:  # docs/explanation/decisions.md
     """Prevent torch from importing triton in a process that has loaded Mesa, where that import crashes.
 
     Torch's optimisers import triton if it is installed, as in torch's CUDA builds. Triton brings its own LLVM, whose

@@ -1,7 +1,7 @@
 """The memory of a controller's last choices, for variants that repeat choices or see them, and their actions.
 
 It is kept in the last columns of the recurrent state. So it moves with the state: when rows leave a batch, and when a
-dream begins at a step of a drive.
+dream begins at a step of a drive. Pages: tasks.md.
 """
 
 from collections.abc import Callable, Sequence

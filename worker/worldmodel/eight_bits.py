@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.worker.worldmodel.onnx_graph import RUNTIME, GraphBuilder
 
-HIGHEST_WEIGHT = 63
+HIGHEST_WEIGHT = 63  # so that processors are one class: docs/how-to/mixed-hosts.md
 CENTRE = 128  # an LSTM's input is an integer from -127 to 127, plus 128
 PIXEL_STEP = np.float32(1 / 255)  # of a picture, whose bytes are a convolution's inputs as they are
 INPUT_STEP = np.float32(1 / 127)  # of an input that is divided by its range

@@ -46,7 +46,7 @@ def open_untrusted_graph(graph: bytes) -> onnxruntime.InferenceSession:
 def open_graph(graph: bytes, threads: int) -> onnxruntime.InferenceSession:
     """Open an ONNX graph on `threads` threads; a row's bits do not depend on their number."""
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1  # docs/explanation/decisions.md
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.load_model_format", "ONNX")  # not the format that its first bytes suggest

@@ -29,7 +29,7 @@ class Prediction(NamedTuple):
     done: Tensor
 
 
-class MDNRNN(nn.Module):
+class MDNRNN(nn.Module):  # mdnrnn_graph.py writes the same step as ONNX
     """From latents, actions and previous reward `(N, T, inputs)` to a prediction for each step.
 
     Attention (Bahdanau et al. 2015, arXiv:1409.0473): score_i = v tanh(W1 x_i + W2 h) over the last `window` inputs
@@ -45,7 +45,7 @@ class MDNRNN(nn.Module):
             self._second_bias.zero_()
         self._second_bias.requires_grad_(False)
         self.heads = nn.Linear(config.hidden, config.outputs)
-        if config.window:
+        if config.window:  # docs/explanation/sources.md, docs/explanation/decisions.md
             self.keys = nn.Linear(config.latent + config.actions, config.attention_units)
             self.query = nn.Linear(config.hidden, config.attention_units, bias=False)
             self.score = nn.Linear(config.attention_units, 1, bias=False)

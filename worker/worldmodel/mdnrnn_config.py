@@ -1,4 +1,4 @@
-"""The configuration of an MDN-RNN, in a module of its own that needs no torch."""
+"""The configuration of an MDN-RNN, in a module of its own that needs no torch. Pages: presets.md, sources.md."""
 
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar

@@ -123,7 +123,7 @@ def export_dream(rnn: Weights, config: MDNRNNConfig, ranges: Ranges | None = Non
         uniform, _ = graph.split(uniform, 1, config.latent - 1)
     exponential = add_exponential if _is_rounded(ranges) else lambda graph, value: graph.node("Exp", value)
     mean, deviation = _select_mixture(graph, mixtures, uniform, temperature, exponential)
-    noise = graph.node("Mul", normal, graph.node("Sqrt", temperature))
+    noise = graph.node("Mul", normal, graph.node("Sqrt", temperature))  # docs/explanation/dreams.md
     spread = graph.node("Mul", exponential(graph, deviation), noise)
     graph.add_output(graph.node("Add", mean, spread), "next_latent", kind, config.latent)
     label = _dreamt_reward_label(graph, reward, config) if config.previous_reward else ""

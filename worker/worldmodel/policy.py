@@ -11,7 +11,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.worker.worldmodel.inference import PolicyStep
 
 
-class ModelPolicy:
+class ModelPolicy:  # docs/explanation/sources.md
     """A controller on latent and hidden state. The state advances at every step, also when an action is repeated.
 
     The MDN-RNN was trained on every step: if steps were skipped, it would misjudge speeds.

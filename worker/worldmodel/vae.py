@@ -1,7 +1,7 @@
 """The variational autoencoder of Ha & Schmidhuber 2018 (appendix A.1) and of its successors.
 
 A checkpoint has the names of its parameters. `export.py`, `worker/training/checkpoint.py` and
-`worker/addons/importing/` read them.
+`worker/addons/importing/` read them. Pages: sources.md.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""The configuration of a VAE, in a module of its own that needs no torch."""
+"""The configuration of a VAE, in a module of its own that needs no torch. Pages: presets.md."""
 
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""Agents without a world model: random drivers, and the network in its training's folder."""
+"""Agents without a world model: random drivers, and the network in its training's folder. Pages: own-environment.md."""
 
 import hashlib
 from collections.abc import Callable, Mapping

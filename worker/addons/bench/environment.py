@@ -1,4 +1,4 @@
-"""Benchmark our CarRacing against gymnasium's, and check that the two are equal."""
+"""Benchmark our CarRacing against gymnasium's, and check that the two are equal. Pages: determinism.md."""
 
 from __future__ import annotations
 

@@ -1,3 +1,3 @@
-"""Bundles taken apart, or rounded to eight bits. Pages: worlds.md, import.md."""
+"""Bundles taken apart, or rounded to eight bits; assemble.py makes them. Pages: worlds.md, import.md, train.md."""
 
 __all__ = ["verb", "extract", "weights_from_graphs"]

@@ -1,4 +1,4 @@
-"""Turn a bundle back into checkpoints from which training can resume."""
+"""Turn a bundle back into checkpoints from which training can resume. Pages: determinism.md."""
 
 from dataclasses import dataclass
 from pathlib import Path

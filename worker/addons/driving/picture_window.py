@@ -1,4 +1,4 @@
-"""A window that shows pictures until somebody closes it."""
+"""A window that shows pictures until somebody closes it. Pages: watch.md."""
 
 from __future__ import annotations
 

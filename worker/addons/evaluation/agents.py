@@ -1,4 +1,7 @@
-"""Agents, which are evaluated, recorded and watched: a controller with its world model, or a trained agent without."""
+"""Agents, which are evaluated, recorded and watched: a controller with its world model, or a trained agent without.
+
+Pages: trust.md.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field

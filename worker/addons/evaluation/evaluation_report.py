@@ -1,4 +1,7 @@
-"""The report that `dreamfleet evaluate` writes: a controller's episodes, and all that is needed to repeat them."""
+"""The report that `dreamfleet evaluate` writes: a controller's episodes, and all that is needed to repeat them.
+
+Pages: own-environment.md, own-world-model.md.
+"""
 
 import json
 from collections.abc import Mapping

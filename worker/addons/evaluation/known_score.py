@@ -1,4 +1,7 @@
-"""The mean score of a controller, where it was measured: of a shipped one by `evaluate`, of others by their run."""
+"""The mean score of a controller, where it was measured: of a shipped one by `evaluate`, of others by their run.
+
+Pages: watch.md, own-environment.md.
+"""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,7 @@
-"""A controller without an episode loop: observation and recurrent state in, action and next state out."""
+"""A controller without an episode loop: observation and recurrent state in, action and next state out.
+
+Pages: python.md.
+"""
 
 from copy import deepcopy
 from threading import Lock

@@ -1,4 +1,7 @@
-"""Parameter vectors of other programs: JSON of the paper's and the article's code, NumPy, text, pycma's output."""
+"""Parameter vectors of other programs: JSON of the paper's and the article's code, NumPy, text, pycma's output.
+
+Pages: ask-tell.md.
+"""
 
 import re
 from pathlib import Path

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 SUMMARY = "read a controller, a world model or drives of another project; no code in them is executed"
 EXTRAS = ("train",)
-LAYOUTS = ("dreamfleet", "wme", "article", "ctallec")
+LAYOUTS = ("dreamfleet", "wme", "article", "ctallec")  # and `Layout` of drives.py
 # How their programs turn a controller's outputs into the action.
 OPTIONS = {"article": '{"pedals": "half"}', "ctallec": '{"actions": "linear"}'}
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from dreamfleet.worker.addons.inspection.survival import Survival
 
 FigureReport: TypeAlias = "Survival | Knowledge | LikenessReport | LossReport"
-FigureName = Literal["survival", "probe", "likeness", "losses"]
+FigureName = Literal["survival", "probe", "likeness", "losses"]  # worker/training/assemble.py keeps some
 FIGURES: tuple[FigureName, ...] = get_args(FigureName)  # in the order of measuring
 OnFigure: TypeAlias = "Callable[[FigureName, FigureReport], None]"
 DRIVES, LOSSES, LIVES = 20, 30, 40

@@ -7,7 +7,7 @@ the steering half a second later.
 
 Quantities that a driver corrects at once, such as the place on the road, do not show in its later actions. So the
 features can also include "views": the directions of [z, h] that correlate best with [z, h] some steps later, by
-canonical correlation analysis (Hotelling 1936).
+canonical correlation analysis (Hotelling 1936). Pages: optimisers.md.
 """
 
 from collections.abc import Callable, Sequence

@@ -3,7 +3,7 @@
 Weights on [z, h] do not fit another encoder's z, nor an MDN-RNN's h after further training. So both models follow the
 same drives, and ridge regression fits the first layer on the new model's [z, h] to the values, before tanh, that the
 old first layer gives on its own model's. Later layers stay as they are. This is behavioural cloning (Pomerleau 1991)
-of the controller, on drives that other drivers may have driven.
+of the controller, on drives that other drivers may have driven. Pages: dreams.md, train.md.
 """
 
 import math

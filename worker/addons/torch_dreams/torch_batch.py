@@ -2,7 +2,7 @@
 
 Every batch has the same number of rows, filled up with its first one: torch chooses kernels by size, and only at one
 size has a fitness the same bits alone and among others. They are not ONNX Runtime's bits, so a worker that dreams like
-this is of a class of its own.
+this is of a class of its own. Pages: decisions.md.
 """
 
 from __future__ import annotations

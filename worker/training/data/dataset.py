@@ -22,7 +22,7 @@ from dreamfleet.worker.tasks.recordable import Preprocessing, RecordableTask
 BEGUN = "preset.json"  # what a data set was begun with
 BEGUN_BYTES = 10_000
 REMEDY = "choose another --data"
-POOL_EPISODES = 48  # episodes whose frames are shuffled together
+POOL_EPISODES = 48  # episodes whose frames are shuffled together (docs/explanation/sources.md)
 POOL_FRAMES = 16_000  # most frames of a pool, unless one episode has more: 200 MB at 64x64, 440 MB at 96x96
 VALIDATION_EVERY = 20  # every 20th episode is held out, whole
 OWN_MEMBERS = frozenset(("action.npy", "reward.npy", "ended.npy"))  # of every episode

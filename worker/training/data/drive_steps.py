@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 FIRST_START = 20  # first step of a drive at which a dream may begin; before it the recurrent state is almost empty
 LOSS_STEPS = 40  # the first world's `lost_after`
-EARLIEST, LATEST = 60, 5  # bounds of the steps before a loss at which a dream may begin
+EARLIEST, LATEST = 60, 5  # bounds of the steps before a loss at which a dream may begin (docs/explanation/dreams.md)
 
 
 class DriveStep(NamedTuple):

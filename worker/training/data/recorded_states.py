@@ -24,7 +24,7 @@ SEED = 0
 
 
 @dataclass(frozen=True)
-class RecordedStates:
+class RecordedStates:  # docs/explanation/dreams.md
     """States `(N, 2 * latent + state)` in half precision: mu, logvar and the recurrent state before the action.
 
     `before_losses` of them lie shortly before a loss of the course, or a death.

@@ -1,4 +1,4 @@
-"""Encoded rollouts as batches of an MDN-RNN, their labels, and the MDN-RNN's states along them."""
+"""Encoded rollouts as batches of an MDN-RNN, their labels, and the MDN-RNN's states along them. Pages: dreams.md."""
 
 from __future__ import annotations
 

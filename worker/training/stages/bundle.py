@@ -1,4 +1,4 @@
-"""Bundling: trained models as one file."""
+"""Bundling: trained models as one file. Pages: dreams.md."""
 
 from __future__ import annotations
 

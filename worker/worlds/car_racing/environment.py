@@ -1,7 +1,7 @@
 """gymnasium's CarRacing-v3 with its own track, physics and rewards; our native module draws only the observation.
 
 `rgb_array` and `human` rendering are gymnasium's. If the native module was not built, `native_check` logs that and
-gymnasium draws. Environments that judge draw some pictures both ways, and stop at a difference.
+gymnasium draws. Environments that judge draw some pictures both ways, and stop at a difference. Pages: platforms.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Compare the native picture with the installed gymnasium's: whether they are equal depends on how pygame was built."""
+"""Compare the native picture with the installed gymnasium's: whether they are equal depends on how pygame was built.
+
+Pages: troubleshooting.md.
+"""
 
 from __future__ import annotations
 

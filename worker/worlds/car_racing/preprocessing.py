@@ -32,7 +32,7 @@ def _row_weights() -> NDArray[np.float32]:
 _ROWS = _row_weights()
 
 
-def _box(observation: Pixels) -> Pixels:
+def _box(observation: Pixels) -> Pixels:  # native/box.c and standalone_drive.py compute the same
     scene = observation[:SCENE_ROWS].reshape(SCENE_ROWS, 96 * 3).astype(np.float32)
     # Every sum is an integer below 2**24, so float32 is exact and BLAS may add in any order.
     rows = (_ROWS @ scene).reshape(SMALL, 32, 3, 3)
@@ -81,7 +81,7 @@ def _raw(observation: Pixels) -> Pixels:
 
 BOX = Preprocessing("box-64", SMALL, _box)
 RAW = Preprocessing("raw-96", 96, _raw, mirrors=False)  # a mirrored indicator bar never occurs
-WHOLE = Preprocessing("whole-64", SMALL, _whole, mirrors=False)
+WHOLE = Preprocessing("whole-64", SMALL, _whole, mirrors=False)  # named in worker/addons/importing/
 PREPROCESSINGS = {each.name: each for each in (BOX, RAW, WHOLE)}  # new data have the first one of their size
 
 

@@ -48,7 +48,7 @@ WORLD = World(
     score_word=FACTS.score_word,
     marks=FACTS.marks,
     mirror=Mirror(order=(0, 1, 2), signs=(-1, 1, 1)),  # steering
-    lost_after=40,
+    lost_after=40,  # as LOSS_STEPS of worker/training/data/drive_steps.py
     opening=50,  # the camera zooms in
     preset="tiny",
 )

@@ -1,4 +1,4 @@
-"""Making an environment by the name and arguments of a task, and what it says of itself."""
+"""Making an environment by the name and arguments of a task, and what it says of itself. Pages: trust.md."""
 
 import re
 import warnings
@@ -186,7 +186,7 @@ def action_meanings(environment: Environment) -> tuple[str, ...]:
 def describe_environment(environment: Environment, frames: int = 1) -> dict[str, Any]:
     """Fields of the environment's `World` that do not depend on its spaces; an action is held for `frames` steps."""
     spec, module = environment.spec, type(environment.unwrapped).__module__
-    limit = (spec and spec.max_episode_steps) or DEFAULT_MAX_STEPS
+    limit = (spec and spec.max_episode_steps) or DEFAULT_MAX_STEPS  # as standalone_play.py
     engine = next((packages for prefix, packages in ENGINES.items() if module.startswith(prefix)), None)
     said: Any = environment.metadata.get("render_fps")
     is_rate = isinstance(said, (int, float)) and isfinite(said) and said > 0

@@ -1,4 +1,7 @@
-"""Any gymnasium environment with pictures as a world in which data are recorded and world models are made."""
+"""Any gymnasium environment with pictures as a world in which data are recorded and world models are made.
+
+Pages: own-world-model.md.
+"""
 
 from __future__ import annotations
 
