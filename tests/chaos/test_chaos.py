@@ -1,6 +1,7 @@
 """Short ones; `make chaos` is the long one.
 
-Tests coordinator/dispatch/fleet.py, coordinator/run/run.py and coordinator/storage/journal.py.
+Tests coordinator/dispatch/fleet.py, coordinator/run/run.py, coordinator/storage/journal.py,
+worker/service/run_session.py and worker/service/slot.py.
 """
 
 import pytest

@@ -1,7 +1,7 @@
 """The examples of docs/reference, docs/how-to and own_agent.py work as written, each in its own language.
 
-Tests coordinator/addons/runs/stored_run.py, dreamfleet/experiments/controllers.py, dreamfleet/experiments/minimise.py
-and dreamfleet/experiments/started_run.py.
+Tests coordinator/addons/runs/stored_run.py, dreamfleet/experiments/controllers.py, dreamfleet/experiments/minimise.py,
+dreamfleet/experiments/started_run.py, worker/dream/environment.py and worker/worlds/car_racing/latent.py.
 """
 
 import re

@@ -1,5 +1,5 @@
 """A run keeps drives of its own mean: the same files on disk, with any workers and any losses.
-Tests coordinator/jobs/rollout_collection.py."""
+Tests coordinator/jobs/rollout_collection.py, worker/scoring/rollout.py and worker/service/outbox.py."""
 
 import io
 import re

@@ -5,7 +5,8 @@ wrote them gave when it continued them. CarRacing computes what it did when it w
 `tests/support/first_world.py` says what is compared, and writes the fixture.
 
 Tests common/runs/journal/schema.py, common/runs/records.py, coordinator/optimisers/checkpoint.py,
-coordinator/optimisers/pycma_state.py and coordinator/storage/journal.py.
+coordinator/optimisers/pycma_state.py, coordinator/storage/journal.py, worker/scoring/scorer.py and
+worker/worlds/car_racing/environment.py.
 """
 
 import json

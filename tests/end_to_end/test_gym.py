@@ -1,6 +1,6 @@
 """gymnasium's own environments and Take Cover on a fleet, without a bundle: learnt to the same bits by any.
 
-Tests coordinator/addons/environment_check.py.
+Tests coordinator/addons/environment_check.py, worker/worlds/gym/task.py and worker/worlds/takecover/task.py.
 """
 
 import json

@@ -1,7 +1,8 @@
 """What unknown senders put on the wire changes nothing and is counted; workers of other protocols get a remedy.
 
 Tests coordinator/dispatch/fleet.py, coordinator/dispatch/refusals.py, coordinator/run/worker_protocol.py,
-coordinator/service/control.py, coordinator/service/inbound_queue.py and coordinator/service/queryables.py.
+coordinator/service/control.py, coordinator/service/inbound_queue.py, coordinator/service/queryables.py and
+worker/service/admission.py.
 """
 
 import json

@@ -1,5 +1,6 @@
 """Watching a live run: real coordinator, real workers, viewers that come, stay too long, and lie.
-Tests common/addons/frames/live.py and worker/addons/live/verb.py."""
+Tests common/addons/frames/live.py, worker/addons/live/verb.py, worker/service/frame_publisher.py and
+worker/service/frame_sampler.py."""
 
 import json
 import signal

@@ -1,6 +1,7 @@
 """The promise: who scored, and who died meanwhile, changes no bit; a host of other bits is of another class.
 
-Tests common/protocol/host_classes.py, coordinator/jobs/generation.py and coordinator/run/run.py.
+Tests common/protocol/host_classes.py, coordinator/jobs/generation.py, coordinator/run/run.py and
+worker/scoring/host_class_probe.py.
 """
 
 import os

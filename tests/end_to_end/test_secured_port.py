@@ -3,7 +3,8 @@
 At an open port the attacker has a session of Zenoh and nothing else: it overhears names, lives, nonces, batches and
 fingerprints. What rules cannot hold off is not here: docs/explanation/threats.md names it.
 
-Tests common/security/access_rules.py, common/security/connection_limiter.py and coordinator/dispatch/fleet.py.
+Tests common/security/access_rules.py, common/security/connection_limiter.py, coordinator/dispatch/fleet.py and
+worker/service/backlog.py.
 """
 
 import resource

@@ -1,4 +1,5 @@
-"""Verbs that work for long, or start others, and Ctrl-C or SIGTERM: what is there is kept and named, nobody is left."""
+"""Verbs that work for long, or start others, and Ctrl-C or SIGTERM: what is there is kept and named, nobody is left.
+Tests worker/service/membership.py."""
 
 import os
 import signal

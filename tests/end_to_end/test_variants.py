@@ -1,5 +1,6 @@
 """Runs whose controllers drive otherwise: each option is replayed to the bit, and every verb knows of it.
-Tests common/artifacts/car_racing_variants.py and common/artifacts/driving.py."""
+Tests common/artifacts/car_racing_variants.py, common/artifacts/driving.py, worker/worldmodel/choice_memory.py and
+worker/worlds/car_racing/task.py."""
 
 import json
 

@@ -1,4 +1,5 @@
-"""World models of another world than the first: made, evolved in, judged, recorded, made anew in rounds."""
+"""World models of another world than the first: made, evolved in, judged, recorded, made anew in rounds.
+Tests worker/dream/task.py and worker/worlds/gym/pixels.py."""
 
 import json
 

@@ -1,4 +1,5 @@
-"""Searching a function's minimum on processes of this host. Tests dreamfleet/experiments/local/search_arguments.py."""
+"""Searching a function's minimum on processes of this host.
+Tests dreamfleet/experiments/local/search_arguments.py and worker/worlds/function/task.py."""
 
 import re
 from contextlib import suppress

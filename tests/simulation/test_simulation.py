@@ -1,8 +1,8 @@
 """A few hundred schedules; `make simulate` plays a hundred thousand.
 
 Tests coordinator/dispatch/leases.py, coordinator/dispatch/member.py, coordinator/dispatch/packing.py,
-coordinator/dispatch/pending_jobs.py, coordinator/dispatch/speculative_execution.py and
-coordinator/run/worker_protocol.py.
+coordinator/dispatch/pending_jobs.py, coordinator/dispatch/speculative_execution.py, coordinator/run/worker_protocol.py,
+worker/service/backlog.py, worker/service/membership.py and worker/service/outbox.py.
 """
 
 from dataclasses import replace

@@ -1,6 +1,6 @@
 """A worker receives and delivers correctly although messages are lost, repeated, foreign or hostile, and after its
 coordinator restarted, or may have forgotten it.
-Tests run_session.py and sender.py."""
+Tests run_session.py, sender.py, backlog.py, failure_log.py, membership.py and outbox.py."""
 
 import hashlib
 import re

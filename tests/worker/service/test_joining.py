@@ -1,5 +1,5 @@
 """How a worker joins a run: it waits, is welcomed or is refused; when and how it leaves.
-Tests admission.py, config.py and worker.py."""
+Tests admission.py, config.py, worker.py, bundle_fetch.py and worker/tasks/registry.py."""
 
 import json
 import os

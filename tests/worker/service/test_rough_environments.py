@@ -1,5 +1,5 @@
 """Slots whose environments fork, crash, hang, or raise what nobody expects.
-Tests common/host/child.py and common/host/descendants.py."""
+Tests common/host/child.py, common/host/descendants.py and slot.py."""
 
 import os
 import queue

@@ -1,4 +1,4 @@
-"""A worker that serves several runs side by side."""
+"""A worker that serves several runs side by side. Tests worker.py, slot_budget.py and membership.py."""
 
 import re
 from concurrent.futures import wait

@@ -1,5 +1,5 @@
 """Dry runs of real environments, each with one fault, in real child processes.
-Tests dry_run_process.py and verb.py."""
+Tests dry_run_process.py, verb.py, worker/addons/task_check.py and worker/tasks/closing.py."""
 
 import os
 import re
