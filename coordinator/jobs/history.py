@@ -1,4 +1,4 @@
-"""Closed generations with running sums, so that a query costs the same however long a run is. Pure."""
+"""Closed generations with running sums, so that a query costs the same however long a run is. Pure. Pages: tasks.md."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Run statuses as Prometheus's text, written by `prometheus_client`. No input or output.
 
 The number of series is bounded: only the first `MAX_WORKERS` workers have their own. Untrusted texts appear as label
-values only, shortened. Pages: decisions.md.
+values only, shortened. `deploy/grafana/dreamfleet.json` draws these. Pages: decisions.md.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

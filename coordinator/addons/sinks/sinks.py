@@ -1,4 +1,7 @@
-"""Records of a run's curves in other programs: the contract, and TensorBoard's."""
+"""Records of a run's curves in other programs: the contract, and TensorBoard's.
+
+`docs/how-to/wandb_sink.py` and `mlflow_sink.py` are others.
+"""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack

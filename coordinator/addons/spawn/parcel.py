@@ -94,7 +94,7 @@ def pack_wheel(*, native: bool) -> Wheel:
     files = dict(_modules(native))
     has_native = any(name.endswith(NATIVE) for name in files)
     platform_tag = re.sub(r"[^a-z0-9]", "_", sysconfig.get_platform().lower())
-    tag, pure = (f"cp311-abi3-{platform_tag}", "false") if has_native else ("py3-none-any", "true")
+    tag, pure = (f"cp311-abi3-{platform_tag}", "false") if has_native else ("py3-none-any", "true")  # pyproject.toml
     files[f"{about}/METADATA"] = _text(found, "METADATA", "PKG-INFO")
     files[f"{about}/entry_points.txt"] = _text(found, "entry_points.txt")
     files[f"{about}/WHEEL"] = f"Wheel-Version: 1.0\nGenerator: {NAME}\nRoot-Is-Purelib: {pure}\nTag: {tag}\n".encode()

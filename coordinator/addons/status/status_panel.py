@@ -37,6 +37,7 @@ from dreamfleet.coordinator.addons.status.terminal_charts import (
 )
 from dreamfleet.coordinator.addons.status.worker_table import WorkerTable
 
+# `coordinator/run/shown_state.py` names the states, and the page colours them in `dashboard/page/live.js`.
 STATE_STYLES = {
     "running": "green",
     "evaluating": "cyan",

@@ -1,4 +1,4 @@
-"""What an iteration does, in order: a round's phases, and which is next."""
+"""What an iteration does, in order: a round's phases, and which is next. Pages: dreams.md."""
 
 from __future__ import annotations
 

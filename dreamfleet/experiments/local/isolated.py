@@ -1,4 +1,7 @@
-"""A function in a process of its own: a typed answer or a typed error over a pipe, its log beside."""
+"""A function in a process of its own: a typed answer or a typed error over a pipe, its log beside.
+
+Pages: platforms.md.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""A run served on this host: its flags checked, its coordinator and workers started, its end awaited."""
+"""A run served on this host: its flags checked, its coordinator and workers started, its end awaited.
+
+Pages: platforms.md.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""What `minimise` and `maximise` are given: numbers, bounds and parameters in the forms of SciPy and pycma."""
+"""What `minimise` and `maximise` are given: numbers, bounds and parameters in the forms of SciPy and pycma.
+
+Pages: own-objective.md.
+"""
 
 import math
 from bisect import bisect_right
