@@ -10,6 +10,7 @@ import json
 import math
 import re
 import socket
+import struct
 import subprocess
 import sys
 from contextlib import ExitStack
@@ -299,6 +300,26 @@ def test_streams_are_counted_where_they_are_opened(processes, random_bundle):
         assert answers.count(b"HTTP/1.1 503") == 8
     assert bridge.ask("DELETE", "/v1/runs/test/batches/a")[0] == 200
     assert [kind for kind, _ in bridge.events("a")][-1] == "end"  # those that left are not counted
+
+
+@pytest.mark.slow
+def test_clients_that_leave_the_stream_of_a_large_batch_cost_others_nothing(bridge):
+    many = 2500  # some pages
+    packed = {"float32": base64.b64encode(vectors(many).tobytes()).decode(), "size": 867}
+    assert bridge.submit({"id": "a", "vectors": packed, "seeds": [1]})[0] == 201
+    found = [*bridge.events("a")]
+    assert [kind for kind, _ in found] == ["candidate"] * many + ["end"]
+    request = f"GET /v1/runs/test/batches/a/events HTTP/1.1\r\nHost: 127.0.0.1:{bridge.port}\r\n\r\n".encode()
+    said = len(bridge.process.lines)
+    for _ in range(20):
+        with socket.create_connection(("127.0.0.1", bridge.port), timeout=DEADLINE) as leaving:
+            leaving.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # it is cut off
+            leaving.sendall(request)
+            assert leaving.recv(1)
+    assert bridge.ask("GET", "/v1/health")[0] == 200
+    again = [*bridge.events("a")]  # in order, as all were done
+    assert again == [*sorted(found[:-1], key=lambda each: each[1]["index"]), found[-1]]
+    assert len(bridge.process.lines) - said < 20
 
 
 @pytest.mark.slow

@@ -5,8 +5,10 @@ import base64
 import json
 import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import asdict
+from functools import partial
 from time import monotonic
 from typing import Any
 
@@ -42,6 +44,7 @@ MAX_BODIES = 4 * MAX_BODY  # bytes of all requests that are being read
 BODY_TIMEOUT = 10.0  # seconds in which `LEAST` bytes of a request's body arrive, or its end
 LEAST = 1 << 16
 MOST_STREAMS = 256
+STREAM_THREADS = 4  # in which all streams read their batches, so that others find one
 KEEP_ALIVE = 10.0  # seconds between two signs of life in a stream of events
 RUN_WAIT = 600.0  # seconds for which a stream waits for a coordinator that does not answer
 OPEN_PATHS = ("/v1/health",)  # need no token
@@ -92,6 +95,7 @@ class _Handlers:
         self._changes, self._description = changes, description
         self._seen: set[str] = set()  # runs whose coordinators have answered: theirs may be resumed
         self.streams = 0  # that are open
+        self._stream_threads = ThreadPoolExecutor(STREAM_THREADS)
         self._held = 0  # bytes of the bodies that are being read
 
     async def health(self, _request: Request) -> Response:
@@ -198,9 +202,17 @@ class _Handlers:
         finally:
             self._held -= sum(map(len, chunks))
 
-    async def _ask(self, run: str, ask: Callable[[], Any]) -> Any:
+    def _read_page(self, run: str, batch: str, offset: int, sent: set[int]) -> tuple[BatchReply, bytes]:
+        """A page of a batch, and the events of its candidates that are done, but for those `sent`, which gets them."""
+        page = self._batches.read(run, batch, offset)
+        new = [each for each in scored_candidates(page) if each.index not in sent]
+        sent.update(each.index for each in new)
+        return page, b"".join(event("candidate", vars(each)) for each in new)
+
+    async def _ask(self, run: str, ask: Callable[[], Any], threads: Executor | None = None) -> Any:
         try:
-            found = await run_in_threadpool(ask)
+            in_thread = asyncio.get_running_loop().run_in_executor(threads, ask) if threads else run_in_threadpool(ask)
+            found = await in_thread
         except ConnectionFailedError as error:
             seen = run in self._seen
             text = f"{error}; ask again with the same id" if seen else str(error)
@@ -210,28 +222,35 @@ class _Handlers:
         return found
 
     async def _stream(self, run: str, first: BatchReply) -> AsyncIterator[bytes]:
-        """An event for each candidate that is done, once; then one that says how the batch ended."""
+        """An event for each candidate that is done, once; then one that says how the batch ended.
+
+        Between two pages other requests have their turn, and a client that left ends its stream.
+        """
         sent: set[int] = set()
+        begin = 0  # all candidates before it are sent
         lost_since, spoke_at = None, monotonic()
         with self._changes.following(run, first.id) as changed:
             while not self._changes.closed:
+                state, offset = None, begin
                 try:
-                    pages = await self._ask(run, lambda: self._read_all(run, first.id))
+                    while state is None or offset < state.population:
+                        read = partial(self._read_page, run, first.id, offset, sent)
+                        page, events = await self._ask(run, read, self._stream_threads)
+                        state, offset = state or page, offset + (len(page.fitness) or page.population)
+                        if events:
+                            yield events
                 except BatchError as error:
                     lost_since = monotonic() if lost_since is None else lost_since
                     if error.refusal != "busy" or monotonic() - lost_since > RUN_WAIT:
                         yield event("error", {"error": error.refusal, "text": str(error)})
                         return
-                    pages = []
                 else:
                     lost_since = None
-                new = [each for page in pages for each in scored_candidates(page) if each.index not in sent]
-                for each in new:
-                    sent.add(each.index)
-                    yield event("candidate", vars(each))
-                if pages and is_final(pages[0]):
-                    yield event("end", _describe(pages[0]))
-                    return
+                    if is_final(state):  # before its pages were read
+                        yield event("end", _describe(state))
+                        return
+                while begin in sent:
+                    begin += 1
                 if monotonic() - spoke_at > KEEP_ALIVE:
                     spoke_at = monotonic()
                     yield b": the batch is being scored\n\n"

@@ -55,7 +55,8 @@ def serve(
     need: above `MOST_CONNECTIONS`, each new one takes the place of another.
     """
     raise_open_file_limit()
-    logging.getLogger("uvicorn.error").addFilter(_OneAMinute())
+    for name in ("uvicorn.error", "asyncio"):
+        logging.getLogger(name).addFilter(_OneAMinute())
     config = uvicorn.Config(
         app, log_config=None, access_log=False, server_header=False, proxy_headers=False, lifespan="off", ws="none",
         http=HttpConnection, backlog=BACKLOG, timeout_graceful_shutdown=SHUTDOWN_TIMEOUT,
@@ -72,7 +73,7 @@ class _OneAMinute(logging.Filter):
 
     def __init__(self) -> None:
         super().__init__()
-        self._next: dict[str, float] = {}  # text -> when it may be said again; uvicorn's warnings are few texts
+        self._next: dict[str, float] = {}  # text -> when it may be said again; their warnings are few texts
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Whether the record is logged."""
