@@ -323,7 +323,8 @@ def about(path: Path) -> dict[str, list[str]]:
     product = [each for each in users if each.parts[0] != "tests"]
     tests = [*own, *sorted({*users, *naming} - {*own, *product})]  # those of its own first
     run = [rf"""(\(|dreamfleet["'],?)\s*["']{between.join(verb.split())}["']""" for verb in near]
-    running = [each for each in sources("tests") if re.search("|".join(run) or "$^", (ROOT / each).read_text())]
+    by_verb = re.compile("|".join(run if len(run) <= FEW else ()) or "(?!)")
+    running = {each for each in sources("tests") if by_verb.search((ROOT / each).read_text())}
     outside = [each for each in product if each.parent != path.parent]
     if f'"{path.stem}"' in (ROOT / room).read_text():
         listed = "the room lists it for others"
@@ -351,7 +352,7 @@ def about(path: Path) -> dict[str, list[str]]:
         "imported by": [f"{each} ({', '.join(names_taken(each, module)) or 'the module'})" for each in product],
         "extended by": list(subclasses(set(public), users)),
         "tests": list(map(str, tests)),
-        "and those of its verbs": sorted(map(str, {*running} - {*tests})) if len(near) <= FEW else [],
+        "and those of its verbs": sorted(map(str, running - {*tests})),
         "reached by the entry points": points,
         "and by the verbs (docs/reference/verbs.md)": [", ".join(near) if len(near) <= 12 else "most of them"],
         "named in": [

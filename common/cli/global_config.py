@@ -24,7 +24,7 @@ from dreamfleet.common.security.credentials import (
     issue_command,
     read_join_file,
 )
-from dreamfleet.common.transport.network import DEFAULT_ENDPOINT, Network, check_endpoint
+from dreamfleet.common.transport.network import DEFAULT_ENDPOINT, SECURED_LOOPBACK, Network, check_endpoint
 
 log = logging.getLogger(__name__)
 ARRAYS = ("stage", "host")  # arrays of tables
@@ -153,8 +153,8 @@ def security_flags(args: argparse.Namespace) -> tuple[str, ...]:
 def resolve_network(args: argparse.Namespace, *roles: str) -> Network:
     """The fleet's address and this program's credentials; the join file's address if none is configured."""
     credentials = load_credentials(args, roles)
-    found = credentials.connect if credentials is not None else ()
-    return Network(connect=args.global_config.connect or found or (DEFAULT_ENDPOINT,), credentials=credentials)
+    own = (DEFAULT_ENDPOINT,) if credentials is None else credentials.connect or (SECURED_LOOPBACK,)
+    return Network(connect=args.global_config.connect or own, credentials=credentials)
 
 
 def _check_variables(environment: Mapping[str, str]) -> dict[str, str]:

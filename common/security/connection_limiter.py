@@ -6,8 +6,8 @@ for a minute, and a process that ran out of descriptors never recovers. While mo
 connections are unauthenticated, a socket filter makes the kernel drop packets of new ones. Open connections stay, and a
 newcomer's kernel retries. Linux only: elsewhere there is no limit.
 
-It also closes connections of those that take part as routers without a router's or coordinator's seat, and lets nobody
-in for a while: between linked routers Zenoh would send others' messages through them. Pages: router.md.
+It also closes connections of those that take part as routers without a router's or coordinator's valid seat, and lets
+nobody in for a while: between linked routers Zenoh would send others' messages through them. Pages: router.md.
 """
 
 import ctypes
@@ -38,15 +38,15 @@ _DROP_ALL = ctypes.create_string_buffer(struct.pack("HBBI", 0x06, 0, 0, 0), 8)  
 _FILTER = struct.pack("@HP", 1, ctypes.addressof(_DROP_ALL))
 
 
-def limit_connections(session: zenoh.Session, ports: Collection[int]) -> None:
+def limit_connections(session: zenoh.Session, ports: Collection[int], revoked_seats: Collection[str]) -> None:
     """Limit connections to the ports on which `session` listens, until it is closed."""
     if sys.platform == "linux":
-        Thread(target=_ConnectionLimiter(session, ports).run, name="gate", daemon=True).start()
+        Thread(target=_ConnectionLimiter(session, ports, revoked_seats).run, name="gate", daemon=True).start()
 
 
 class _ConnectionLimiter:
-    def __init__(self, session: zenoh.Session, ports: Collection[int]) -> None:
-        self._info, self._ports = session.info, ports
+    def __init__(self, session: zenoh.Session, ports: Collection[int], revoked_seats: Collection[str]) -> None:
+        self._info, self._ports, self._revoked_seats = session.info, ports, revoked_seats
         self._listening = [each for each in self._port_descriptors() if self._is_listening(each)]
         self._open, self._unauthenticated = 0, 0
         self._links_changed = True
@@ -102,7 +102,7 @@ class _ConnectionLimiter:
         routing = {str(each.zid) for each in self._info.transports() if str(each.whatami) != "client"}
         links = [each for each in self._info.links() if str(each.zid) in routing] if routing else []
         seats = {_end(each.dst.partition("/")[2]): each.auth_identifier
-                 for each in links if not _may_route(each.auth_identifier)}  # fmt: skip
+                 for each in links if not self._may_route(each.auth_identifier)}  # fmt: skip
         if not seats:
             return
         self._links_changed = True  # until they are gone
@@ -115,6 +115,11 @@ class _ConnectionLimiter:
             text = f"{seat} takes part as a router, which it may not: its connections are closed, and new ones wait"
             log_event(log, "false_router", text, level=logging.WARNING, identity=seat)
         self._warned |= set(seats.values())
+
+    def _may_route(self, seat: str | None) -> bool:
+        if seat is None:  # by a password, of which Zenoh says nothing
+            return True
+        return seat.partition(".")[0] in LISTENERS and seat not in self._revoked_seats
 
     def _close_waiting(self, listening: socket.socket) -> None:
         """Close waiting connections, which would take the spare descriptors; Zenoh may accept some of them first."""
@@ -150,10 +155,6 @@ def _open_spare_descriptors() -> list[int]:
         while len(found) < SPARE_DESCRIPTORS:
             found.append(os.open(os.devnull, os.O_RDONLY))
     return found
-
-
-def _may_route(seat: str | None) -> bool:
-    return seat is None or seat.partition(".")[0] in LISTENERS  # None: by a password, of which Zenoh says nothing
 
 
 def _end(address: str) -> tuple[str, str]:

@@ -13,7 +13,8 @@ from dreamfleet.common.security.credentials import Credentials
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 LOOPBACK = "127.0.0.1"
 SECURED_PREFIX = "tls/"  # prefix of a secured fleet's endpoints
-SECURED_ENDPOINT = "tls/0.0.0.0:7447"  # default of a secured coordinator
+SECURED_ENDPOINT = "tls/0.0.0.0:7447"  # default of a secured coordinator, which is found on its own host at the next
+SECURED_LOOPBACK = "tls/127.0.0.1:7447"
 LOOK_INTERVAL = 0.02  # seconds between two looks whether a process of this host listens
 _LOOPBACK_HEADER = re.compile(r"(localhost|127\.\d+\.\d+\.\d+|\[::1\])(:\d+)?", re.IGNORECASE)
 _ENDPOINT = re.compile(r"(tcp|tls|udp|quic)/(\[[0-9a-fA-F:]+(?:%[\w.-]+)?\]|[^:/\s%]+):(\d{1,5})")
@@ -103,7 +104,7 @@ def names_loopback(host_header: str) -> bool:
 def check_endpoint(endpoint: str) -> str:
     """Return `endpoint` if it is well formed, else raise `UsageError`."""
     found = _ENDPOINT.fullmatch(endpoint)
-    if not found or int(found[3]) > 65535:
+    if not found or not 0 < int(found[3]) <= 65535:
         hint = "" if "/" in endpoint or ":" in endpoint else "; a run's name goes elsewhere: see --help"
         example = f"tcp/127.0.0.1:{endpoint}" if endpoint.isdecimal() else f"{DEFAULT_ENDPOINT}{hint}"
         raise UsageError(f"{endpoint!r} is not an endpoint: write tcp/HOST:PORT, such as {example}")

@@ -56,7 +56,8 @@ def open_session(network: Network, *, timeout: float | None = CONNECT_TIMEOUT) -
             network, timeout = _reachable_first(network, timeout or 0.0), CONNECT_TIMEOUT
         session = _open_zenoh(zenoh_config(network, timeout, dictionary))
     if network.listen and network.credentials is not None:
-        limit_connections(session, {int(each.rpartition(":")[2]) for each in network.listen})
+        ports = {int(each.rpartition(":")[2]) for each in network.listen}
+        limit_connections(session, ports, network.revoked_seats)
     return session
 
 

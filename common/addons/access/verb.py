@@ -129,6 +129,10 @@ def revoke_join_files(args: argparse.Namespace) -> int:
     text = f"{role} {args.name} ({identity}) is revoked: {soon}routers let it do nothing from their next start on"
     if gives_all := authority.uses_passwords and role in LISTENERS:
         text += ". Its file gives all passwords of the fleet: if another has it, make another authority"
+    elif role in LISTENERS:
+        text += (
+            ". Who connects does not check that: if others can answer at its address with it, make another authority"
+        )
     print_answer(args, text, name=args.name, role=role, identity=identity, files=len(found), gives_all=gives_all)
     return 0
 

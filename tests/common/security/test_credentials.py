@@ -476,14 +476,17 @@ def test_many_unauthenticated_connections_delay_only_new_ones(tmp_path, caplog):
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="descriptors of this process are found in /proc")
-@pytest.mark.parametrize("mode", ["router", "peer"])
-def test_only_seats_that_listen_take_part_as_routers(tmp_path, caplog, mode):
+@pytest.mark.parametrize(
+    ("who", "mode"), [("worker.1", "router"), ("worker.1", "peer"), ("router.2", "router"), ("coordinator.2", "router")]
+)
+def test_only_valid_seats_that_listen_take_part_as_routers(tmp_path, caplog, who, mode):
     authority, port = Authority.create(tmp_path / "access"), free_port()
     files = {}
-    for role in ("coordinator", "router", "worker"):
-        connect = [] if role == "coordinator" else ["tls/127.0.0.1:7447"]
-        authority.issue(role, role, tmp_path / role, connect=connect)
-        files[role] = read_join_file(tmp_path / role)
+    for role, number in (("coordinator", 1), ("router", 1), ("worker", 1), ("router", 2), ("coordinator", 2)):
+        name = f"{role}.{number}"
+        authority.issue(role, name, tmp_path / name, connect=["tls/127.0.0.1:7447"])
+        files[name] = read_join_file(tmp_path / name)
+    revoked = frozenset(("router.2", "coordinator.2"))
     endpoint = f"tls/127.0.0.1:{port}"
     caplog.set_level(logging.WARNING, "dreamfleet.router")
 
@@ -494,15 +497,16 @@ def test_only_seats_that_listen_take_part_as_routers(tmp_path, caplog, mode):
         return sum(str(each.whatami) == whatami for each in home.info.transports())
 
     with ExitStack() as stack:
-        home = stack.enter_context(open_session(Network(listen=(endpoint,), credentials=files["coordinator"])))
-        stack.enter_context(open_session(Network(connect=(endpoint,), credentials=files["worker"])))
-        far = Network(listen=(f"tls/127.0.0.1:{free_port()}",), connect=(endpoint,), credentials=files["router"])
+        own = Network(listen=(endpoint,), credentials=files["coordinator.1"], revoked_seats=revoked)
+        home = stack.enter_context(open_session(own))
+        stack.enter_context(open_session(Network(connect=(endpoint,), credentials=files["worker.1"])))
+        far = Network(listen=(f"tls/127.0.0.1:{free_port()}",), connect=(endpoint,), credentials=files["router.1"])
         stack.enter_context(open_session(far, timeout=None))
         until(lambda: sessions("router") == 1, "the other router is not linked")
-        settings = zenoh_config(Network(connect=(endpoint,), credentials=files["worker"]), DEADLINE)
+        settings = zenoh_config(Network(connect=(endpoint,), credentials=files[who]), DEADLINE)
         settings |= {"mode": mode, "listen": {"endpoints": []}}
         stack.enter_context(zenoh.open(zenoh.Config.from_json5(json.dumps(settings))))
-        until(lambda: any(each.get("identity") == "worker.1" for each in facts()), "it is not noticed")
+        until(lambda: any(each.get("identity") == who for each in facts()), "it is not noticed")
         until(lambda: sessions("peer") == 0 and sessions("router") == 1, "it stays")
         assert sessions("client") == 1
         assert len(facts()) == 1
