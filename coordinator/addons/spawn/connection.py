@@ -73,7 +73,7 @@ class Connection:
         self._stderr_lines: deque[str] = deque(maxlen=KEPT_LINES)
         self._forwards = {each.translate(_BRACKETS): each for each in forwards}  # as ssh names them
         self._ports: dict[str, int] = {}
-        self._stray = 0  # bytes beside answers
+        self._stray, self._last_stray = 0, ""  # bytes beside answers, and their last line
         self._fault = ""  # why this side ended the connection
         self._changed = threading.Condition()
         try:
@@ -115,7 +115,7 @@ class Connection:
             if not self._changed.wait_for(
                 lambda: self._ports.keys() >= set(forwards) or self._child.exit_code is not None, FORWARD
             ):
-                raise ConnectionFailedError("ssh did not say which port its tunnel was given")
+                raise ConnectionFailedError("ssh did not say which port its tunnel has: run it without -q")
         if not self._ports.keys() >= set(forwards):
             raise self._failure()
         return [self._ports[each] for each in forwards]
@@ -172,6 +172,7 @@ class Connection:
                 return None, None
             begins = line.endswith(b"\n")
             self._stray += len(line)
+            self._last_stray = line[:MAX_MESSAGE].decode(errors="replace").strip() or self._last_stray
             if self._stray >= MAX_LINE:
                 self._end(
                     f"it prints more than {MAX_LINE >> 20} MiB that are not an answer: `ssh {self._address} true` must "
@@ -206,7 +207,8 @@ class Connection:
             return ConnectionFailedError(self._fault)
         self._child.wait(EXIT_TIMEOUT)
         self._listener.join(EXIT_TIMEOUT)
-        return ConnectionFailedError(explain(list(self._stderr_lines), self._child.exit_code, self._address))
+        said = [self._last_stray, *self._stderr_lines]
+        return ConnectionFailedError(explain(said, self._child.exit_code, self._address))
 
     def _listen(self) -> None:
         assert self._child.popen.stderr is not None

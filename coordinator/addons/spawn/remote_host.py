@@ -36,8 +36,8 @@ class WorkerAnswer:
 
     name: Name
     running: bool
-    slots: Count | None
-    age: float | None  # seconds since its start
+    slots: Annotated[int, Meta(ge=0, le=1 << 20)] | None
+    age: Annotated[float, Meta(ge=0, le=1 << 32)] | None  # seconds since its start
     digest: Name | None
     last: Line  # of its log
 

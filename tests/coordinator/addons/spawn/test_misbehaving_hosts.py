@@ -22,6 +22,11 @@ from dreamfleet.coordinator.addons.spawn.remote_host import FAILED, FleetAddress
 from tests.support.processes import DEADLINE
 
 GOOD = 'os.execvp("/bin/sh", ["sh", "-c", sys.argv[-1]])\n'
+LOOK = {
+    "python": [3, 11], "executable": "p", "machine": "m", "system": "s", "installed": None, "venv": True,
+    "writable": True, "noexec": False, "root": "r", "free": 1, "environments": [],
+    "workers": [{"name": "a", "running": True, "slots": 1, "age": 1e300, "digest": None, "last": ""}],
+}  # fmt: skip
 READY = 'say("dreamfleet-host " + json.dumps({"ok": {}}))\n'
 FORM = ""  # what is said of it is the same, whichever form it is; of others it names a request or an amount
 MUCH, SILENT, ENDLESS = r"\b1\b", r"\b3\b", r"\b\d+\b"
@@ -41,6 +46,8 @@ MISBEHAVIOUR = {
     "lines-amid-a-look": (READY + "\nwhile True: say('dreamfleet-host {\"line\": \"hello\"}'); time.sleep(1)", FORM),
     "endless-errors": ("while True: os.write(2, b'x' * 65536)", SILENT),
     "silence": ("time.sleep(1000)", SILENT),
+    "a-refusal": ("say('no account 47'); sys.exit(1)", "47"),
+    "a-huge-age": (READY + "\nsay('dreamfleet-host ' + json.dumps({'ok': LOOK}))", "age"),
     "what-it-never-reads": (READY + "time.sleep(1000)", SILENT),
 }  # fmt: skip
 
@@ -56,7 +63,7 @@ def fake_ssh(tmp_path):
     path.write_text(
         f"#!{sys.executable}\nimport json, os, sys, time\n"
         "def say(text): os.write(1, text.encode() + b'\\n')\n"
-        f"host = sys.argv[-2]\n{branches}{GOOD}"
+        f"host, LOOK = sys.argv[-2], {LOOK!r}\n{branches}{GOOD}"
     )
     path.chmod(path.stat().st_mode | stat.S_IXUSR)
     return shlex.quote(str(path))
