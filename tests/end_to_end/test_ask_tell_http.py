@@ -312,10 +312,13 @@ def test_clients_that_leave_the_stream_of_a_large_batch_cost_others_nothing(brid
     request = f"GET /v1/runs/test/batches/a/events HTTP/1.1\r\nHost: 127.0.0.1:{bridge.port}\r\n\r\n".encode()
     said = len(bridge.process.lines)
     for _ in range(20):
-        with socket.create_connection(("127.0.0.1", bridge.port), timeout=DEADLINE) as leaving:
+        with socket.socket() as leaving:
+            leaving.settimeout(DEADLINE)
             leaving.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # it is cut off
+            leaving.connect(("127.0.0.1", bridge.port))
             leaving.sendall(request)
-            assert leaving.recv(1)
+            while b"event: candidate" not in leaving.recv(100):
+                pass
     assert bridge.ask("GET", "/v1/health")[0] == 200
     again = [*bridge.events("a")]  # in order, as all were done
     assert again == [*sorted(found[:-1], key=lambda each: each[1]["index"]), found[-1]]
