@@ -351,8 +351,8 @@ def about(path: Path) -> dict[str, list[str]]:
         "bound by": list(rules_of(module, through)),
         "imported by": [f"{each} ({', '.join(names_taken(each, module)) or 'the module'})" for each in product],
         "extended by": list(subclasses(set(public), users)),
-        "tests": list(map(str, tests)),
-        "and those of its verbs": sorted(map(str, running - {*tests})),
+        "tests": list(map(str, tests)) or ["none"],
+        "and those of its verbs": sorted(map(str, running - {*tests})) if len(near) <= FEW else ["too many verbs"],
         "reached by the entry points": points,
         "and by the verbs (docs/reference/verbs.md)": [", ".join(near) if len(near) <= 12 else "most of them"],
         "named in": [

@@ -1,4 +1,4 @@
-"""Files that a run reads and writes: bundles, controllers, agents, subspaces; their actions and options.
+"""Files that a run reads and writes: bundles, controllers, agents, subspaces; and what their vectors mean to a task.
 
 Pages: files.md, worlds.md, import.md, determinism.md.
 """

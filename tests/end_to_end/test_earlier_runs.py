@@ -6,7 +6,7 @@ wrote them gave when it continued them. CarRacing computes what it did when it w
 
 Tests common/runs/journal/schema.py, common/runs/records.py, coordinator/optimisers/checkpoint.py,
 coordinator/optimisers/pycma_state.py, coordinator/storage/journal.py, worker/scoring/scorer.py and
-worker/worlds/car_racing/environment.py.
+worker/worlds/car_racing/environment.py, worker/worldmodel/export.py.
 """
 
 import json

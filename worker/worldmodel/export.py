@@ -2,7 +2,8 @@
 
 They are written by hand rather than traced, because a row's bits must not depend on the batch: weights are constant
 initializers, and no node gathers, loops or reshapes by a traced batch size. docs/explanation/determinism.md says which
-hosts share bits. A bundle that exists holds its own graphs. Pages: decisions.md.
+hosts share bits. A bundle that exists plays by its own graphs, but `unbundle` compares them with those of today: a
+change of their bytes needs new bundles. Pages: decisions.md.
 """
 
 from collections.abc import Callable
