@@ -29,11 +29,7 @@ _EXTERNAL_DATA, _DATA_LOCATION = 13, 14  # of TensorProto
 
 _VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5  # protobuf's wire types
 # By onnx.proto's TensorProto.DataType.
-_FLOATS: dict[int, np.dtype[Any]] = {
-    1: np.dtype("<f4"),
-    10: np.dtype("<f2"),
-    11: np.dtype("<f8"),
-}
+_FLOATS: dict[int, np.dtype[Any]] = {1: np.dtype("<f4"), 10: np.dtype("<f2"), 11: np.dtype("<f8")}
 
 
 def has_finite_weights(model: bytes) -> bool:

@@ -18,11 +18,7 @@ from dreamfleet.common.protocol.failures import Failure, FailureKind
 from dreamfleet.common.protocol.function_values import is_minimised
 from dreamfleet.common.protocol.measures import MAX_AXES, MAX_AXIS
 from dreamfleet.common.protocol.messages import Horizon, Packages, Patience, Share, TaskSpec
-from dreamfleet.common.runs.standard_error import (
-    error_from_population_std,
-    error_from_sample_std,
-    format_with_error,
-)
+from dreamfleet.common.runs.standard_error import error_from_population_std, error_from_sample_std, format_with_error
 from dreamfleet.common.schema.validation import OPTIONAL, Count, MalformedError, from_plain, to_plain
 
 MAX_STAGES = 32  # of a schedule; statuses contain them too

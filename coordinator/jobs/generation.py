@@ -239,17 +239,22 @@ class Generation:
         measures[~self._failed] = np.nanmean(counting[~self._failed], axis=1)
         return measures
 
-    def candidate_scores(self) -> CandidateScores:
-        """The scores of all candidates so far."""
-        counting = self._counting
-        scored = counting & np.isfinite(self._scores)
+    def candidate_scores(self, page: slice = slice(None)) -> CandidateScores:
+        """The scores of all candidates so far, or of some."""
+        counting, scores = self._counting[page], self._scores[page]
+        scored = counting & np.isfinite(scores)
         done = scored.sum(axis=1)
-        totals = np.where(scored, self._scores, 0.0).sum(axis=1)
+        totals = np.where(scored, scores, 0.0).sum(axis=1)
         means = [
             to_finite(total / count) if count else None
             for total, count in zip(totals.tolist(), done.tolist(), strict=True)
         ]
         return CandidateScores(self.number, done.tolist(), counting.sum(axis=1).tolist(), means)
+
+    @property
+    def candidates_done(self) -> int:
+        """How many candidates have all scores that count."""
+        return int((~(self._counting & ~np.isfinite(self._scores)).any(axis=1)).sum())
 
     @property
     def _counting(self) -> NDArray[np.bool_]:

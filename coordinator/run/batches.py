@@ -222,15 +222,13 @@ class Batches:
             fitness = self._journal.batches.fitness_page(batch.generation, offset, limit)
             return fitness, dict(batch.errors), batch.population
         assert isinstance(generations, ExternalGenerations)
-        scores = generation.candidate_scores()
-        is_done = [done == wanted for done, wanted in zip(scores.done, scores.wanted, strict=True)]
-        page = slice(offset, offset + limit)
-        columns = zip(scores.fitness[page], is_done[page], strict=True)
-        fitness = [value if done else None for value, done in columns]
+        scores = generation.candidate_scores(slice(offset, offset + limit))
+        columns = zip(scores.fitness, scores.done, scores.wanted, strict=True)
+        fitness = [value if done == wanted else None for value, done, wanted in columns]
         failed = [each for each in generation.without_fitness if offset <= each < offset + limit]
         for each in failed:
             fitness[each - offset] = None
-        return fitness, generations.find_errors(generation, failed) if failed else {}, sum(is_done)
+        return fitness, generations.find_errors(generation, failed) if failed else {}, generation.candidates_done
 
     @property
     def _open_generation(self) -> Generation | None:

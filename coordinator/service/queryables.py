@@ -1,11 +1,14 @@
-"""Queries that Zenoh's own threads answer: status from the latest snapshot, the world model from an immutable file.
+"""Queries that need no turn of the run: status from the latest snapshot, the world model from an immutable file.
 
-No query ends a thread or the run: an exception is counted, logged and answered as an error.
+No query ends a thread or the run: an exception is counted, logged and answered as an error. Answers have threads of
+their own, since Zenoh receives all messages of a link in one thread.
 """
 
 import json
+import queue
 from collections.abc import Callable
 from contextlib import suppress
+from threading import Thread
 from typing import Any
 
 import zenoh
@@ -20,6 +23,7 @@ from dreamfleet.coordinator.service.status import encode_part
 from dreamfleet.coordinator.storage.served_bundle import ServedBundle
 
 Answer = Callable[[zenoh.Query], None]
+MOST_WAITING = 64  # queries of a part; further ones are dropped without an answer (R26)
 
 
 def declare_status(
@@ -28,11 +32,17 @@ def declare_status(
     """Declare a queryable for each part of the status; an answer reads only the `latest` snapshot."""
 
     def declare(part: str) -> Any:
-        def answer(query: zenoh.Query) -> None:
-            payload = encode_part(latest(), part, query.parameters.get)
-            query.reply(keys.status(name, part), payload, encoding="application/json")
+        encoded, payloads = latest(), dict[str, bytes]()  # of one snapshot: it takes long, and many may ask alike
 
-        return session.declare_queryable(keys.status(name, part), guarded_callback(answer, error_counter))
+        def answer(query: zenoh.Query) -> None:
+            nonlocal encoded, payloads
+            if (snapshot := latest()) is not encoded:
+                encoded, payloads = snapshot, {}
+            if (wanted := str(query.parameters)) not in payloads:
+                payloads[wanted] = encode_part(snapshot, part, query.parameters.get)
+            query.reply(keys.status(name, part), payloads[wanted], encoding="application/json")
+
+        return session.declare_queryable(keys.status(name, part), _in_own_thread(answer, error_counter))
 
     return [declare(part) for part in PARTS]
 
@@ -59,22 +69,32 @@ def declare_bundle(
         part = BundlePart(**head, offset=offset, total=total, data=data)
         query.reply(key, encode(part), encoding=encoding(BundlePart))
 
-    return session.declare_queryable(key, guarded_callback(answer, error_counter))
+    return session.declare_queryable(key, _in_own_thread(answer, error_counter))
 
 
-def guarded_callback(answer: Answer, error_counter: ErrorCounter) -> Any:
-    """A Zenoh callback for `answer`; if that raises, the reply is an error."""
+def _in_own_thread(answer: Answer, error_counter: ErrorCounter) -> Any:
+    """A Zenoh callback for `answer`, which runs in a thread until the queryable ends; if it raises, it is an error."""
+    waiting: queue.SimpleQueue[zenoh.Query | None] = queue.SimpleQueue()
 
-    def guard(query: zenoh.Query) -> None:
-        with query:
-            try:
-                answer(query)
-            except Exception as error:
-                error_counter.record("query", error, query)
-                with suppress(zenoh.ZError):
+    def enqueue(query: zenoh.Query) -> None:
+        if waiting.qsize() < MOST_WAITING:
+            waiting.put(query)
+        else:
+            query.drop()  # type: ignore[no-untyped-call]
+
+    def run() -> None:
+        while (query := waiting.get()) is not None:
+            with query, suppress(zenoh.ZError):  # the session has been closed
+                try:
+                    answer(query)
+                except zenoh.ZError:
+                    raise
+                except Exception as error:
+                    error_counter.record("query", error, query)
                     query.reply_err(_error_body("this query could not be answered; the coordinator's log says why"))
 
-    return zenoh.handlers.Callback(guard, indirect=False)
+    Thread(target=run, name="answers", daemon=True).start()
+    return zenoh.handlers.Callback(enqueue, lambda: waiting.put(None), indirect=False)
 
 
 def _error_body(text: str) -> bytes:

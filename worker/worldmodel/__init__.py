@@ -1,8 +1,6 @@
 """The world model: frozen in ONNX Runtime for inference, as torch modules for training, and the export between them.
 
-What `scoring` imports of it has no torch.
-
-Pages: determinism.md, worlds.md, import.md, train.md.
+What `scoring` imports of it has no torch. Pages: determinism.md, worlds.md, import.md, train.md.
 """
 
 import os

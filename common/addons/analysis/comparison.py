@@ -2,7 +2,6 @@
 
 All runs evaluate their means on the same validation tracks and confirm reports on the same fresh ones. Luck with tracks
 is therefore common to both scores and cancels in a difference per track (`common/runs/paired_difference.py`).
-
 Pages: dashboard.md.
 """
 

@@ -4,7 +4,6 @@ Files of `torch.save` are read by torch's reader of weights: it calls nothing th
 
 Its LSTM takes the action before the latent, its encoder gives the log deviation, its mixture has one weight for all
 latents, and its controller's outputs are the action. A bundle says the rest: the layers, the pictures and the heads.
-
 Pages: decisions.md.
 """
 

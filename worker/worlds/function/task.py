@@ -2,7 +2,6 @@
 
 The task's name is `function:MODULE:NAME`. There is no controller: a candidate's numbers are the coordinates of the
 function's arguments. What the coordinates mean stands in the task's options (`common/artifacts/objective.py`).
-
 Pages: python.md.
 """
 

@@ -2,7 +2,6 @@
 
 The task's name is `gym:` and the environment's id, for example `gym:LunarLander-v3`, or, with a package that must be
 imported first, `gym:my_package:MyWorld-v0`. `with_options` makes of it the task of its pictures, for world models.
-
 Pages: watch.md, export.md.
 """
 
