@@ -116,7 +116,7 @@ class RevocationWatcher:
         if is_revoked or own.time_left <= timedelta():
             raise AccessError(
                 f"the join file of {own.identity} ({own.name}) {'is revoked' if is_revoked else 'has expired'}: have "
-                f"another issued with `{issue_command(own.role, own.name)}`"
+                f"another issued with `{issue_command(own.role, own.name, own.connect)}`"
             )
 
     def reload_if_changed(self, now: float) -> None:

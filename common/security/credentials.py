@@ -87,9 +87,10 @@ class Credentials:
             )
 
 
-def issue_command(role: str, name: str) -> str:
+def issue_command(role: str, name: str, connect: tuple[str, ...] = ()) -> str:
     """The command by which a join file of this role is issued, in full; a listener is reached by names."""
-    reached = ("--host", "HOST") if role in LISTENERS else ("--connect", "tls/HOST:7447")
+    there = connect or (() if role in LISTENERS else ("tls/HOST:7447",))
+    reached = [*(("--host", "HOST") if role in LISTENERS else ()), *(("--connect", *there) if there else ())]
     return join(("dreamfleet", "access", "issue", role, name, *reached, "--out", "FILE"))
 
 

@@ -430,11 +430,14 @@ def test_every_verb_refuses_an_edited_file(seats, tmp_path, capsys, verb):
 
 
 @pytest.mark.parametrize("role", SEATS)
-def test_the_command_that_an_error_names_issues_a_file(tmp_path, role):
+@pytest.mark.parametrize("connect", [(), ("tls/h.example:7447", "tls/far.example:1")])
+def test_the_command_that_an_error_names_issues_a_file(tmp_path, role, connect):
     Authority.create(tmp_path / "access")
-    words = shlex.split(issue_command(role, "box").replace("FILE", str(tmp_path / "join")))
+    words = shlex.split(issue_command(role, "box", connect).replace("FILE", str(tmp_path / "join")))
     assert main([*words[1:], "--access-dir", str(tmp_path / "access")]) == 0
-    assert read_join_file(tmp_path / "join").role == role
+    made = read_join_file(tmp_path / "join")
+    assert made.role == role
+    assert made.connect == connect or not connect
 
 
 @pytest.mark.parametrize("days", [-91, 3])
