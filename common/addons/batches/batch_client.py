@@ -27,6 +27,7 @@ from dreamfleet.common.protocol.messages import MAX_PART
 from dreamfleet.common.schema.validation import MalformedError
 
 QUERY_TIMEOUT = 3.0  # seconds
+LEAST_RATE = 1e6  # bytes of a batch that a busy coordinator stores a second
 PARTS_AT_ONCE = 32  # of a body: what a coordinator's queue holds, many times over
 GRACE = 2.0  # seconds after the timeout to wait for Zenoh's end-of-replies signal
 
@@ -47,7 +48,7 @@ class BatchClient:
         for start in range(0, len(offsets), PARTS_AT_ONCE):
             some = offsets[start : start + PARTS_AT_ONCE]
             sent = [(f"{header.parameters};offset={each}", body[each : each + MAX_PART]) for each in some]
-            for reply in self._query(run, "submit", sent):
+            for reply in self._query(run, "submit", sent, QUERY_TIMEOUT + header.total / LEAST_RATE):
                 last = reply if last is None or last.state == "uploading" else last
             if last is not None and last.state != "uploading":
                 return last
@@ -78,16 +79,18 @@ class BatchClient:
         handler = zenoh.handlers.Callback(receive, indirect=False)
         return self._session.declare_subscriber(keys.event_batch(run), handler)
 
-    def _query(self, run: str, verb: str, sent: Sequence[tuple[str, bytes | None]]) -> list[BatchReply]:
+    def _query(
+        self, run: str, verb: str, sent: Sequence[tuple[str, bytes | None]], timeout: float = QUERY_TIMEOUT
+    ) -> list[BatchReply]:
         """The reply to each of these queries, which are sent at once; the first refusal is raised."""
         self._client.check_join_file()
         replies: queue.SimpleQueue[Any] = queue.SimpleQueue()
         key = keys.batch(keys.check_run_name(run), verb)
         for parameters, payload in sent:
             handler = zenoh.handlers.Callback(replies.put, lambda: replies.put(None), indirect=False)
-            self._session.get(f"{key}?{parameters}", handler, timeout=QUERY_TIMEOUT, payload=payload)
+            self._session.get(f"{key}?{parameters}", handler, timeout=timeout, payload=payload)
         found: list[BatchReply] = []
-        left, deadline = len(sent), monotonic() + QUERY_TIMEOUT + GRACE
+        left, deadline = len(sent), monotonic() + timeout + GRACE
         while left:
             try:
                 reply = replies.get(timeout=max(deadline - monotonic(), 0.0))
