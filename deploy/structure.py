@@ -16,6 +16,7 @@ import tomllib
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -200,11 +201,18 @@ def measure() -> dict[str, object]:
     return figures
 
 
+@cache
 def listed_modules(test: Path) -> set[str]:
     """The files that a test's docstring lists behind "Tests": with their folders, or of the folder that it mirrors."""
     docstring = re.match(r'"""(.*?)"""', (ROOT / test).read_text(), re.DOTALL)
     names = re.findall(r"[\w/]+\.py\b", docstring[1].partition("Tests ")[2]) if docstring else []
     return {name if "/" in name else mirrored(test.with_name(name)) for name in names}
+
+
+def tests_of(path: Path) -> list[Path]:
+    """The tests of a product file: the one that mirrors it, and those that list it."""
+    mirror = Path(f"tests/{path.parent}/test_{path.name}".replace("dreamfleet/", ""))
+    return [each for each in sources("tests") if each == mirror or str(path) in listed_modules(each)]
 
 
 def mirrored(test: Path) -> str:
@@ -317,8 +325,7 @@ def about(path: Path) -> dict[str, list[str]]:
     pages = set().union(*map(pages_of, (path, *rooms)))
     in_code = re.compile("|".join([named, *calls, *written]))
     in_pages = re.compile("|".join([named, *written, *codes, *worlds]))
-    own_test = Path(f"tests/{path.parent}/test_{path.name}".replace("dreamfleet/", ""))
-    own = [each for each in sources("tests") if each == own_test or str(path) in listed_modules(each)]
+    own = tests_of(path)
     naming = {each for each in sources("tests") if in_code.search((ROOT / each).read_text())}
     product = [each for each in users if each.parts[0] != "tests"]
     tests = [*own, *sorted({*users, *naming} - {*own, *product})]  # those of its own first
@@ -352,6 +359,9 @@ def about(path: Path) -> dict[str, list[str]]:
         "imported by": [f"{each} ({', '.join(names_taken(each, module)) or 'the module'})" for each in product],
         "extended by": list(subclasses(set(public), users)),
         "tests": list(map(str, tests)) or ["none"],
+        "those of its importers": sorted(
+            {str(test) for each in product for test in tests_of(each)} - {*map(str, tests)}
+        ),
         "and those of its verbs": sorted(map(str, running - {*tests})) if len(near) <= FEW else ["too many verbs"],
         "reached by the entry points": points,
         "and by the verbs (docs/reference/verbs.md)": [", ".join(near) if len(near) <= 12 else "most of them"],

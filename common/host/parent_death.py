@@ -1,6 +1,7 @@
 """Child processes that end with their parent, also on SIGKILL, and leave Ctrl-C to the parent.
 
-`python -m dreamfleet.common.host.parent_death PARENT_PID COMMAND` runs a command that ends with the parent.
+`python -m dreamfleet.common.host.parent_death PARENT_PID COMMAND` runs a command that ends with the parent. Take Cover
+runs this file alone, with `python -I -S`: it imports the standard library only.
 """
 
 import ctypes

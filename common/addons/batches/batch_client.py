@@ -25,11 +25,11 @@ from dreamfleet.common.protocol.batches import (
 from dreamfleet.common.protocol.codec import decode_json
 from dreamfleet.common.protocol.messages import MAX_PART
 from dreamfleet.common.schema.validation import MalformedError
+from dreamfleet.common.transport.query import GRACE
 
 QUERY_TIMEOUT = 3.0  # seconds
 LEAST_RATE = 1e6  # bytes of a batch that a busy coordinator stores a second
 PARTS_AT_ONCE = 32  # of a body: what a coordinator's queue holds, many times over
-GRACE = 2.0  # seconds after the timeout to wait for Zenoh's end-of-replies signal
 
 
 class BatchClient:

@@ -1,3 +1,5 @@
+"""Optimisers by name: what they need and keep. Tests registry.py, pycma.py, pycma_state.py and api.py."""
+
 import subprocess
 import sys
 from importlib.metadata import entry_points

@@ -1,4 +1,5 @@
-"""Take Cover as a task and as an environment. Tests game.py, options.py and process.py."""
+"""Take Cover as a task and as an environment. Tests game.py, options.py, process.py
+and common/host/parent_death.py."""
 
 import ctypes
 import json
