@@ -38,7 +38,7 @@ def declare_status(
             nonlocal encoded, payloads
             if (snapshot := latest()) is not encoded:
                 encoded, payloads = snapshot, {}
-            if (wanted := str(query.parameters)) not in payloads:
+            if (wanted := part and str(query.parameters)) not in payloads:  # the status itself has none
                 payloads[wanted] = encode_part(snapshot, part, query.parameters.get)
             query.reply(keys.status(name, part), payloads[wanted], encoding="application/json")
 

@@ -72,8 +72,8 @@ def test_few_queries_wait_and_those_alike_are_answered_at_one_cost(coordinator):
     replies, many = SimpleQueue(), 3 * MOST_WAITING
     coordinator.ask(replies)
     until(lambda: coordinator.encoded == [""])
-    for _ in range(many):
-        coordinator.ask(replies)
+    for number in range(many):
+        coordinator.ask(replies, parameters=f"x={number}")  # the status has no parameters
     coordinator.asking.put(OTHER, b"")
     coordinator.heard.get(timeout=DEADLINE)  # after all queries
     coordinator.may_answer.set()
@@ -81,6 +81,7 @@ def test_few_queries_wait_and_those_alike_are_answered_at_one_cost(coordinator):
     assert coordinator.encoded == [""]
     coordinator.shown = snapshot(generations=9)
     coordinator.ask(replies)
-    coordinator.ask(replies, parameters="offset=1")
-    until(lambda: replies.qsize() == MOST_WAITING + 3)
-    assert coordinator.encoded == ["", "", ""]
+    coordinator.ask(replies, "best", "offset=0")
+    coordinator.ask(replies, "best", "offset=1")
+    until(lambda: replies.qsize() == MOST_WAITING + 4)
+    assert sorted(coordinator.encoded) == ["", "", "best", "best"]
