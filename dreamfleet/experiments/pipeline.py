@@ -9,6 +9,7 @@ from dreamfleet.common.cli.command_line import parse_flags
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.host.stop_signals import Stop, never_stop
+from dreamfleet.common.printable import plural
 from dreamfleet.worker.addons.bundles import verb as bundle
 from dreamfleet.worker.training.stages import StageReport
 from dreamfleet.worker.training.stages.bundle import BundleRequest, build_bundle
@@ -79,6 +80,6 @@ def check_vae(data: Path) -> None:
         more = shell_command("train", "vae", "--data", data, "--updates", MORE * updates)
         raise DreamfleetError(
             f"the VAE in {data} is no better than the mean picture (squared error {error:g}, not below "
-            f"{mean:g}) after {updates:,} updates: train it longer with `{more}`, then give this command again; "
-            "--yes goes on with it"
+            f"{mean:g}) after {plural(updates, 'update')}: train it longer with `{more}`, then give this command "
+            "again; --yes goes on with it"
         )

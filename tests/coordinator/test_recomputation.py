@@ -174,6 +174,7 @@ def check_status(processes, found):
     assert shown == pytest.approx([fitness.mean(), fitness.std(), fitness.max(), fitness.min()])
 
 
+@pytest.mark.exact
 @pytest.mark.slow
 def test_a_run_is_what_its_journal_comes_to(processes, random_bundle):
     answer = started(processes, random_bundle)

@@ -192,3 +192,16 @@ def test_a_clone_without_links_stops_and_names_the_setting(words, tmp_path):
     link.unlink()
     link.mkdir()
     assert run().returncode == 0
+
+
+def test_each_extra_that_a_text_names_exists():
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    texts = [*ROOT.glob("docs/**/*.md"), ROOT / "README.md", ROOT / "tests" / "golden" / "messages.txt"]
+    for folder in ("common", "coordinator", "worker", "dreamfleet", "deploy"):
+        texts += (ROOT / folder).rglob("*.py")
+    named = {
+        (name, str(path.relative_to(ROOT)))
+        for path in texts for names in re.findall(r"\bdreamfleet\[([\w, -]+)\]", path.read_text())
+        for name in names.split(",")
+    }  # fmt: skip
+    assert {each for each in named if each[0].strip() not in extras} == set()

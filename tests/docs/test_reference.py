@@ -3,14 +3,17 @@
 import json
 import re
 import subprocess
+from typing import Unpack, get_type_hints
 
 import pytest
 
+import dreamfleet
 from deploy import reference
 from dreamfleet.common.cli.global_config import TABLES
 from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.common.runs.seeds import TEST
 from dreamfleet.coordinator.addons.metrics.prometheus import collect_metrics
+from dreamfleet.experiments.local.run_arguments import RunArguments
 from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
 from tests.support.processes import ROOT
 from tests.support.samples import STATUS
@@ -70,3 +73,8 @@ def test_a_record_is_of_a_shipped_controller_and_the_page_has_its_figures(path, 
 )
 def test_make_names_the_run_to_reproduce(words, said):
     assert said in subprocess.check_output(["make", "--dry-run", *words.split()], cwd=ROOT, text=True)
+
+
+@pytest.mark.parametrize("function", [dreamfleet.start_run, dreamfleet.evolve])
+def test_what_starts_a_run_takes_typed_settings(function):
+    assert get_type_hints(function)["settings"] == Unpack[RunArguments]

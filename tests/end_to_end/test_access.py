@@ -30,6 +30,7 @@ from tests.support.samples import MSGPACK
 from tests.support.stage import drained, listening, wait_for
 
 LIFE = "0badc0de"
+LEFT = 60  # seconds of a certificate that ends while a run is served
 
 
 @pytest.mark.slow
@@ -255,6 +256,23 @@ def test_nobody_listens_beyond_this_host_without_security_unless_that_is_said(pr
     process.wait_for_event("insecure")
     process.end()
     processes.refused(f"tls/0.0.0.0:{processes.port}", *words, "--join", access.path("coordinator"))
+
+
+@pytest.mark.slow
+def test_a_coordinator_whose_certificate_ends_while_it_serves_leaves_and_so_does_its_worker(
+    processes, tmp_path, endpoint
+):
+    access = Access(tmp_path / "access")
+    own, ends = access.path("short"), datetime.now(UTC) + timedelta(seconds=LEFT)
+    access.authority.issue("coordinator", "short", own, hosts=["home.example"], days=1, now=ends - timedelta(days=1))
+    access.path("coordinator").unlink()
+    own.rename(access.path("coordinator"))
+    coordinator = begin(processes, access, endpoint, None, "--generations", 10_000)
+    worker = work(processes, access, endpoint, "first", "safe", "--exit-when-done", "--coordinator-timeout", 1)
+    worker.wait_for_event("joined")
+    assert coordinator.finish()[0] == 1
+    assert datetime.now(UTC) >= ends - timedelta(seconds=1)
+    assert worker.finish()[0] == 1
 
 
 @pytest.mark.slow

@@ -26,6 +26,7 @@ def back_up(processes, to, name="test", call=call_here):
     return call("runs", "backup", name, "--runs-dir", processes.runs, "--to", to)
 
 
+@pytest.mark.exact
 @pytest.mark.slow
 def test_a_run_goes_on_from_a_copy_that_was_made_while_it_was_served(processes, small, random_bundle, tmp_path):
     flags = (*small, "--generations", GENERATIONS, "--collect-every", 1, "--collect-episodes", 1)

@@ -87,6 +87,7 @@ def test_a_host_whose_results_differ_is_barred_and_the_run_has_the_bits_of_an_ho
 
 
 @pytest.mark.slow
+@pytest.mark.exact
 def test_the_coordinators_own_host_decides_against_a_single_other_one(processes, settings, honest, tmp_path):
     """The own host's worker shows the key in the cache folder that it shares with the coordinator."""
     coordinator = processes.coordinator(*settings, "--verify", 1)
@@ -97,6 +98,7 @@ def test_the_coordinators_own_host_decides_against_a_single_other_one(processes,
 
 
 @pytest.mark.long
+@pytest.mark.exact
 @pytest.mark.parametrize("moment", ["before", "after"])
 def test_a_coordinator_that_is_killed_amid_a_recall_goes_on_as_if_it_had_not_been(
     processes, settings, honest, moment, tmp_path
@@ -116,6 +118,7 @@ def test_a_coordinator_that_is_killed_amid_a_recall_goes_on_as_if_it_had_not_bee
 
 
 @pytest.mark.slow
+@pytest.mark.exact
 def test_a_host_that_the_operator_bars_is_recalled_live_and_after_the_end(processes, settings, honest):
     """Nothing is checked: the operator knows it from elsewhere."""
     liars = {"bad": {LIES: 0.5}, "worse": {LIES: 0.9}}

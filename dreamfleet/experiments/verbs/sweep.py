@@ -272,6 +272,6 @@ def _draw(folder: SweepFolder, results: list[RunResult]) -> Path | None:
     try:
         from dreamfleet.experiments.sweep.figure import plot_sweep
     except ModuleNotFoundError:
-        print("no figure: it needs pip install 'dreamfleet[plot]'", file=sys.stderr)
+        print("no figure: it needs pip install 'dreamfleet[views]'", file=sys.stderr)
         return None
     return path if plot_sweep(results, path) else None

@@ -41,7 +41,13 @@ from dreamfleet.common.security.credentials import (
     read_join_file,
     worker_seat_identity,
 )
-from dreamfleet.common.security.handshake import EXPIRED, NOT_YET_VALID, check_certificate, diagnose_connection
+from dreamfleet.common.security.handshake import (
+    EXPIRED,
+    NOT_YET_VALID,
+    check_certificate,
+    describe_clock_error,
+    diagnose_connection,
+)
 from dreamfleet.common.transport.network import Network
 from dreamfleet.common.transport.session import open_session, zenoh_config
 from tests.support.access import Access
@@ -446,7 +452,10 @@ def test_a_wrong_clock_is_called_that(seats, tmp_path, days):
     issued = seats.authority.issue("viewer", "early", tmp_path / "join", connect=["tls/h.example:1"], now=now)
     with pytest.raises(AccessError) as refused:
         check_certificate(issued)
-    assert refused.value.__cause__.verify_code in (NOT_YET_VALID, EXPIRED)
+    cause = refused.value.__cause__
+    assert cause.verify_code in (NOT_YET_VALID, EXPIRED)
+    assert describe_clock_error(cause)
+    assert describe_clock_error(cause).partition(",")[0] in str(refused.value)  # but for the minute
 
 
 @pytest.mark.slow

@@ -96,6 +96,7 @@ def bar(bench, host, others):
     assert bench.run.state.ended
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_race_from_which_lies_are_recalled_is_one_without_them(ended, begin, seed):
     settings = replace(RACE, seed=seed)
@@ -120,6 +121,7 @@ class Broken(Failing):
             super().answer_one(name, job)
 
 
+@pytest.mark.exact
 def test_a_race_that_is_resumed_after_the_fault_of_a_host_is_one_without_it(ended, begin):
     honest = ended(RACE)
     bench = begin(lambda job: bench.is_broken and job.candidate < 2 and job.episode == 0, RACE, Broken)
@@ -190,6 +192,7 @@ def test_a_replayed_strategy_asks_for_what_the_stored_one_asks_for(ended, optimi
     np.testing.assert_array_equal(asked[::2], asked[1::2])
 
 
+@pytest.mark.exact
 def test_candidates_that_were_drawn_anew_are_drawn_anew_again(ended):
     fails = lambda job: job.kind == "score" and job.digest[0] % 8 == 0  # noqa: E731
     bench = ended(replace(CMA, on_failure="redraw"), fails=fails)

@@ -162,6 +162,7 @@ class Trial:
             self.counts[f"{taker} {'error' if is_error else 'equal'}"] += 1
 
 
+@pytest.mark.exact
 @pytest.mark.slow
 @pytest.mark.parametrize("copies", [COPIES, pytest.param(MANY, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", ["ended", "stopped"])
