@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from functools import partial
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
 
 import numpy as np
@@ -82,6 +82,12 @@ def test_help_lists_the_exit_codes_and_a_missing_verb_names_it(words, capsys):
     is_help = words.endswith("--help")
     assert left.value.code == (0 if is_help else UsageError.exit_code)
     assert ("130" if is_help else "--help") in "".join(capsys.readouterr())
+
+
+def test_the_version_is_that_of_the_installed_package(capsys):
+    with pytest.raises(SystemExit):
+        command_line.main(["--version"])
+    assert capsys.readouterr().out.split() == ["dreamfleet", version("dreamfleet")]
 
 
 def test_a_broken_verb_does_not_affect_others(capsys, tmp_path):

@@ -4,6 +4,7 @@ Tests fork.py, run_setup.py and stage_tables.py."""
 import argparse
 import re
 from dataclasses import replace
+from importlib.metadata import version
 
 import numpy as np
 import pytest
@@ -152,6 +153,7 @@ def test_the_log_says_when_a_stage_begins_and_why(staged):
 def test_the_status_says_which_stage_it_is_and_what_counts_there(staged):
     bench, found = staged(), []
     bench.end(lambda: found.append(take_snapshot(bench.run, "night", {}, 0.0, 0.0).status))
+    assert {each.package for each in found} == {version("dreamfleet")}
     seen = {(each.generation.stage.number, each.generation.stage.since) for each in found}
     assert seen == {(number, since) for number, since in enumerate(BEGUN, 1)}
     settings = LiveRunView.of_status(found[-1]).stage_settings
