@@ -131,7 +131,7 @@ def revoke_join_files(args: argparse.Namespace) -> int:
         text += ". Its file gives all passwords of the fleet: if another has it, make another authority"
     elif role in LISTENERS:
         text += (
-            ". Who connects does not check that: if others can answer at its address with it, make another authority"
+            ". Clients and workers do not check it: if others can answer at its address with it, make another authority"
         )
     print_answer(args, text, name=args.name, role=role, identity=identity, files=len(found), gives_all=gives_all)
     return 0

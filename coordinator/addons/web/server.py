@@ -51,8 +51,8 @@ def serve(
 ) -> None:  # fmt: skip
     """Serve until Ctrl-C or SIGTERM, then await `end_streams`: those of pages are endless.
 
-    A connection stays open for `keep_alive` seconds after a request. Clients without a token can hold none that others
-    need: above `MOST_CONNECTIONS`, each new one takes the place of another.
+    A connection stays open for `keep_alive` seconds after a request. Above `MOST_CONNECTIONS`, each new one takes the
+    place of another, so clients without a token keep nobody out.
     """
     raise_open_file_limit()
     for name in ("uvicorn.error", "asyncio"):
