@@ -83,6 +83,7 @@ class Odd(gymnasium.Env):
     def __init__(self, fault="", render_mode=None):
         self._fault = fault
         self._steps = 0  # of all episodes
+        self.env = sys  # some keep their simulator here; it is no environment
         if fault == "noisy":
             print("a simulator greets")  # noqa: T201
         if fault in _DEEDS:

@@ -269,14 +269,14 @@ def _describe_pictures(name: str, environment: Any) -> list[str]:
 
 def _observed(environment: Any) -> dict[str, Any]:
     """The spaces that a controller sees: those of a Dict by their keys, before it is flattened, or the only one."""
+    from gymnasium import Wrapper
     from gymnasium.spaces import Dict
 
     each = environment
-    while each is not None:
-        if isinstance(each.observation_space, Dict):
-            return dict(each.observation_space.spaces)
-        each = getattr(each, "env", None)
-    return {"": environment.observation_space}
+    while isinstance(each, Wrapper) and not isinstance(each.observation_space, Dict):
+        each = each.env
+    seen = each.observation_space
+    return dict(seen.spaces) if isinstance(seen, Dict) else {"": environment.observation_space}
 
 
 def _describe_left_out(environment: Any) -> list[str]:
