@@ -8,7 +8,10 @@ from numpy.typing import NDArray
 
 
 class StepSnapshot(NamedTuple):
-    """One step of an episode for a live view, taken before its action is applied."""
+    """One step of an episode for a live view, taken before its action is applied.
+
+    `scoring/host_class_probe.py` hashes every field: another field is another class of every host.
+    """
 
     step: int  # number of steps before it
     score: float  # sum of the rewards of those

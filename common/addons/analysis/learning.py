@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.function_values import is_minimised, value_of
 from dreamfleet.common.protocol.tasks import DREAM
-from dreamfleet.common.runs.effort import Effort
+from dreamfleet.common.runs.effort import Effort, GenerationEffort
 from dreamfleet.common.runs.records import in_values
 from dreamfleet.common.runs.run_folder import RunFolder
 
@@ -57,13 +57,20 @@ class LearningCurve:
 
 def points_of(run: RunFolder, *, as_values: bool) -> Iterator[Point]:
     """Each evaluation, with the effort spent up to its generation: a function's own values, or fitness."""
-    spent = run.start_effort()
-    efforts = deque(each for each in run.efforts() if not each.confirming)
-    for evaluation in run.evaluations():
-        while efforts and efforts[0].generation <= evaluation.generation:
-            spent += efforts.popleft().effort
+    evaluations = run.evaluations()
+    spent = efforts_until([each.generation for each in evaluations], run.start_effort(), run.efforts())
+    for until, evaluation in zip(spent, evaluations, strict=True):
         score = value_of(evaluation.mean, run.spec) if as_values else evaluation.mean
-        yield Point(spent, score, evaluation.error)
+        yield Point(until, score, evaluation.error)
+
+
+def efforts_until(generations: Iterable[int], start: Effort, efforts: Iterable[GenerationEffort]) -> Iterator[Effort]:
+    """The total effort after each of these ascending generations, without that of confirmations."""
+    left = deque(sorted((each for each in efforts if not each.confirming), key=lambda each: each.generation))
+    for generation in generations:
+        while left and left[0].generation <= generation:
+            start += left.popleft().effort
+        yield start
 
 
 def world_of(run: RunFolder) -> str:

@@ -4,7 +4,7 @@
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -19,7 +19,7 @@ from dreamfleet.common.protocol.function_values import (
 )
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import DREAM, is_function_task
-from dreamfleet.common.runs.effort import Effort, GenerationEffort
+from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.records import (
     RunSettings,
     StoredConfirmation,
@@ -113,19 +113,6 @@ def curves(
 def _value_axis(task: TaskSpec, *, is_log: bool) -> str:
     goal = "smaller is better" if is_minimised(task) else "larger is better"
     return f"value: {goal}{' (log scale)' if is_log else ''}"
-
-
-def cumulative_effort(start: Effort, efforts: Iterable[GenerationEffort], generations: int) -> list[Effort]:
-    """The total effort after each of so many generations, without that of confirmations."""
-    by_generation: dict[int, Effort] = {}
-    for each in efforts:
-        if not each.confirming:
-            by_generation[each.generation] = by_generation.get(each.generation, Effort()) + each.effort
-    found, total = [], start
-    for number in range(generations):
-        total += by_generation.get(number, Effort())
-        found.append(total)
-    return found
 
 
 def _band(rows: Sequence[StoredGeneration], quartiles: Quartiles | None, task: TaskSpec) -> list[tuple[float, float]]:

@@ -8,6 +8,7 @@ from math import isnan
 from pathlib import Path
 from typing import Any
 
+from dreamfleet.common.addons.analysis.learning import efforts_until
 from dreamfleet.common.addons.analysis.run_archive import RunArchive
 from dreamfleet.common.addons.analysis.scored_history import scored_history
 from dreamfleet.common.artifacts.bundle import Bundle
@@ -30,7 +31,7 @@ from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import resume_command, run_paths
 from dreamfleet.common.runs.stages import stages_of
 from dreamfleet.common.schema.times import format_time, parse_time
-from dreamfleet.coordinator.addons.dashboard.curves import Quartiles, RunData, cumulative_effort, curves, downsample
+from dreamfleet.coordinator.addons.dashboard.curves import Quartiles, RunData, curves, downsample
 from dreamfleet.coordinator.addons.dashboard.host_history import host_history
 from dreamfleet.coordinator.addons.dashboard.page_state import NONE, Facts, tile
 from dreamfleet.coordinator.addons.runs.run_details import run_row, setting_rows, view_of
@@ -52,7 +53,7 @@ def describe_run(runs_dir: Path, name: str) -> dict[str, Any]:
             raise JournalError(f"the journal of run {name} is damaged: generations are missing; restore it from a copy")
         data = RunData(settings, history, run.evaluations(), run.confirmation(), run.episode_limit)
         start, efforts = run.start_effort(), run.efforts()
-        spent = cumulative_effort(start, efforts, len(history))
+        spent = list(efforts_until(range(len(history)), start, efforts))
         total = sum((each.effort for each in efforts), start)
         view, plain = view_of(run), expand_task_options(asdict(settings))
         rows = setting_rows(settings, plain, run.episode_limit)

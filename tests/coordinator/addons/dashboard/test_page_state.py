@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from dreamfleet.common.addons.analysis.learning import efforts_until
 from dreamfleet.common.client.equal_fitness import ENOUGH
 from dreamfleet.common.client.status import EpisodeProgress, FailureStatus, WorkerCount
 from dreamfleet.common.runs.effort import Effort, GenerationEffort
@@ -15,7 +16,6 @@ from dreamfleet.common.runs.records import StoredConfirmation, StoredEvaluation
 from dreamfleet.coordinator.addons.dashboard.curves import (
     MOST_POINTS,
     RunData,
-    cumulative_effort,
     curves,
     downsample,
     sampling_step,
@@ -148,14 +148,14 @@ def test_effort_includes_the_start_and_excludes_confirmations():
         GenerationEffort(0, False, Effort(10, 0, 0, 36 * 10**8)), GenerationEffort(0, True, Effort(0, 99, 0, 1)),
         GenerationEffort(2, False, Effort(5, 7, 0, 36 * 10**8)),
     ]  # fmt: skip
-    spent = cumulative_effort(Effort(100), efforts, 3)
+    spent = list(efforts_until(range(3), Effort(100), efforts))
     assert [each.steps for each in spent] == [110, 110, 122]
     drawn = curves(data(3), None, spent)
     assert (drawn["steps"], drawn["core_hours"]) == ([110, 110, 122], [1.0, 1.0, 2.0])
 
 
 def test_an_evaluation_of_an_open_generation_has_the_total_effort():
-    spent = cumulative_effort(Effort(), [], 3)
+    spent = list(efforts_until(range(3), Effort(), []))
     odd = replace(data(3), evaluations=[StoredEvaluation(2**62, 1, 1.0, 0.0)])
     assert curves(odd, None, spent)["evaluations"]["steps"] == [0]
     assert curves(odd, None, spent)["evaluations"]["error"] == [None], "of one episode"
