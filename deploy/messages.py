@@ -115,7 +115,7 @@ class Messages(ast.NodeTransformer):
         if isinstance(node.func, ast.Attribute):
             node.func = self._visit_value(node.func, speaks=False)
         speaks = name in SPEAKERS or name.endswith("Error")
-        has_code = name.endswith("Error") and len(node.args) > 1  # an error's text, and what kind it is
+        has_code = len(node.args) > 1 and (name.endswith("Error") or name == "log_event")  # a text, and what kind it is
         node.args = [self._visit_value(each, speaks=speaks and not (has_code and _is_code(each))) for each in node.args]
         for keyword in node.keywords:
             if keyword.arg not in {"help", "metavar", "description"}:
