@@ -1,4 +1,4 @@
-"""An agent that was trained without a world model, as one file: an uncompressed zip of an ONNX graph and a manifest."""
+"""An agent trained without a world model: a stored zip of an ONNX graph and a manifest. Pages: baselines.md."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""What a world model's manifest says of its world, so that nobody needs the world's package to begin a run in it.
+"""What a world model's manifest says of its world: to begin a run in it needs no package of the world.
 
-Bundles that exist must stay readable, and score alike: a new field has a default and `metadata=OPTIONAL`.
+Bundles stay readable and score alike: a new field has a default and is OPTIONAL. Pages: dreams.md, takecover.md.
 """
 
 from __future__ import annotations

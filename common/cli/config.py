@@ -2,7 +2,7 @@
 
 Later sources in this list override earlier ones. A section is one dataclass: `[run]` in TOML, `DREAMFLEET_RUN_...` in
 the environment, its field names as flags. The unnamed section is the top of the file and `DREAMFLEET_...`. An unknown
-key is an error that suggests the nearest one. A section's field `preset`, if it has one, names the preset.
+key is an error that suggests the nearest one. A section's field `preset` names the preset. Pages: decisions-notes.md.
 """
 
 import argparse

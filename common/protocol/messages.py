@@ -1,7 +1,7 @@
 """All messages of protocol version 2, frozen: structs in msgpack, dataclasses in JSON.
 
 The annotations are the schema, which msgspec checks. A message has at most `MAX_MESSAGE` bytes; larger batches are
-split, and long vectors and files are sent in parts. Pages: share-a-fleet.md, tasks.md, threats.md.
+split, and long vectors and files are sent in parts. Pages: share-a-fleet.md, tasks.md, threats.md, operations-notes.md.
 """
 
 from __future__ import annotations

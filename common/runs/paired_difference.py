@@ -1,4 +1,4 @@
-"""Comparison of two controllers on the seeds that both were evaluated on. Pages: export.md, protocol.md."""
+"""Comparison of two controllers on the seeds that both were evaluated on. Pages: export.md, protocol.md, results.md."""
 
 from __future__ import annotations
 

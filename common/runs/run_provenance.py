@@ -1,6 +1,6 @@
 """The provenance of a controller: all that is needed to repeat its run.
 
-A controller's file holds it as `receipt`, beside the run's settings and the score. Pages: export.md, determinism.md.
+A controller's file holds it as `receipt`, beside settings and score. Pages: export.md, determinism.md, results.md.
 """
 
 from __future__ import annotations

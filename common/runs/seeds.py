@@ -1,6 +1,6 @@
 """The split of episode seeds, so that no controller is evaluated on a track that selected it.
 
-0-9999 unused; 10000-19999 test; 20000-999999 validation; training from 2**20 up. Pages: ask-tell.md, tasks.md.
+0-9999 unused; 10000-19999 test; 20000-999999 validation; training from 2**20. Pages: ask-tell.md, tasks.md, results.md.
 """
 
 import hashlib

@@ -1,7 +1,4 @@
-"""The standard error of a mean: the one place that computes it, and that prints it after a ±.
-
-It follows from the sample's standard deviation, with n - 1 in the denominator. One value has none: `None`.
-"""
+"""The one place that computes a standard error, from the sample's deviation, and prints it. Pages: results.md."""
 
 import math
 from collections.abc import Sequence

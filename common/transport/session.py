@@ -1,7 +1,7 @@
 """Opening Zenoh sessions with a safe configuration.
 
-Zenoh's defaults listen on all interfaces with multicast scouting and gossip, use shared memory, which makes small
-messages ten times slower, and allow 1000 sessions. The configuration here changes all of these. Pages: decisions.md.
+Zenoh's defaults listen everywhere with scouting and gossip, use shared memory, which makes small messages ten times
+slower, and allow 1000 sessions. This changes all that. Pages: decisions.md, measurements.md, operations-notes.md.
 """
 
 import base64

@@ -1,4 +1,4 @@
-"""What a world that ships says of itself to every host: its presets, its published scores, its demonstration."""
+"""What a world that ships tells every host: its presets, published scores, demonstration. Pages: measurements.md."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

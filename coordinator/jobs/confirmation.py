@@ -5,7 +5,7 @@ halving: all on some tracks, the better half on as many more, until one is left.
 its reported score comes from fresh tracks that chose nothing.
 
 R28: everything follows from finished evaluations and from scores in the journal, with fixed seeds. So a coordinator
-that restarts anywhere continues to the bit. Pages: dreams.md.
+that restarts anywhere continues to the bit. Pages: dreams.md, measurements.md, results.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,9 @@
 """The demonstration: a coordinator and one worker per core on this machine, as a person would start them.
 
 Two runs: one in the dream, and one in reality from the dream's best mean. It starts coordinator and workers as
-processes and watches over Zenoh. It judges and records by the worker's functions. Pages: dashboard.md, README.md.
+processes and watches over Zenoh. It judges and records by the worker's functions.
+
+Pages: dashboard.md, README.md, measurements.md.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Re-run a run from the provenance in its controller. Pages: determinism.md, export.md."""
+"""Re-run a run from the provenance in its controller. Pages: determinism.md, export.md, results.md."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ Importing this registers `dreamfleet/Dream-v0` for the world of any bundle, also
 >>> environment.metadata["render_fps"]
 50
 
-Pages: dreams.md, tasks.md, worlds.md, determinism.md.
+Pages: dreams.md, dreams-notes.md, tasks.md, worlds.md, determinism.md.
 """
 
 from __future__ import annotations

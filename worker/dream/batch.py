@@ -21,7 +21,7 @@ from dreamfleet.worker.tasks.watching import StepObserver, StepSnapshot
 
 DEFAULT_TEMPERATURE = 1.0
 MAX_ROWS = 256  # episodes that are dreamt together: larger batches are slower (docs/explanation/decisions.md)
-TORCH_ROWS = 512  # on a torch device: half of what a worker may hold, so that the next are there when these are over
+TORCH_ROWS = 512  # on a torch device: half of what a worker may hold, for the next wait there: docs/lab/measurements.md
 
 
 class DreamBatch:

@@ -98,7 +98,7 @@ def add_disturbance(actions: Continuous, chosen: Floats, push: Floats) -> Floats
     return done
 
 
-class ActionBursts:  # `--spells` of docs/explanation/dreams.md
+class ActionBursts:  # `--spells` of docs/explanation/dreams.md and docs/lab/dreams-notes.md
     """Sometimes replaces an action that rests at a bound, which noise leaves alone, by a random value for some steps.
 
     Value and length of a burst are uniformly distributed. The bursts depend only on the seed and the chosen actions.

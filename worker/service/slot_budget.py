@@ -2,7 +2,7 @@
 
 Weighted fair queueing (Demers, Keshav and Shenker 1989): a run pays for the seconds in which it holds slots, divided by
 its share. A free slot goes to the waiting run that has paid least. A run that was idle for longer gets no
-credit for that. Pages: share-a-fleet.md.
+credit for that. Pages: share-a-fleet.md, operations-notes.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Assemble a bundle from trained weights. Pages: worlds.md, sources.md."""
+"""Assemble a bundle from trained weights. Pages: worlds.md, sources.md, dreams-notes.md."""
 
 from __future__ import annotations
 

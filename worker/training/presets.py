@@ -1,6 +1,6 @@
 """The presets of whole trainings: amounts of data and updates, and the models' layers.
 
-A row of docs/reference/presets.md each. Pages: sources.md.
+A row of docs/reference/presets.md each. Pages: sources.md, operations-notes.md.
 """
 
 from dataclasses import dataclass, field

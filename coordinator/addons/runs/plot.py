@@ -1,6 +1,6 @@
 """Plots: one run's fitness over its generations, and learning curves of several runs over the effort spent.
 
-Pages: python.md, own-objective.md.
+Pages: python.md, own-objective.md, results.md.
 """
 
 import textwrap

@@ -7,8 +7,6 @@ too, less how many do where reality loses nothing; reality's is 1. A dream that 
 
 A new model is refused if a figure that both have is clearly worse: lower by more than two standard errors of the
 difference, and by more than `MARGIN`. What could not be measured of both refuses nothing.
-
-Pages: dreams.md, dreams-notes.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What an iteration does, in order: a round's phases, and which is next. Pages: dreams.md."""
+"""What an iteration does, in order: a round's phases, and which is next."""
 
 from __future__ import annotations
 

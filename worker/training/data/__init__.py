@@ -1,4 +1,4 @@
-"""A data set of recorded drives: collected, stored, read. Pages: train.md, files.md."""
+"""A data set of recorded drives: collected, stored, read. Pages: train.md, files.md, dreams-notes.md."""
 
 __all__ = [
     "dataset",

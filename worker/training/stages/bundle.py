@@ -1,4 +1,4 @@
-"""Bundling: trained models as one file. Pages: dreams.md."""
+"""Bundling: trained models as one file. Pages: dreams.md, dreams-notes.md."""
 
 from __future__ import annotations
 
