@@ -317,14 +317,9 @@ def _decode_controller(about: dict[str, Any], data: bytes) -> Controller:
         shape = from_plain_lenient(ControllerShape, about["shape"])
         parameters = np.frombuffer(data, dtype="<f4").astype(np.float32)
         controller = Controller(
-            shape,
-            parameters,
-            str(about["task"]),
-            str(about["bundle"]),
-            dict(about.get("provenance", {})),
-            str(about.get("options", "")),
-            int(about.get("version", 1)),
-        )
+            shape, parameters, str(about["task"]), str(about["bundle"]), dict(about.get("provenance", {})),
+            str(about.get("options", "")), int(about.get("version", 1)),
+        )  # fmt: skip
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise ControllerError(f"the run's controller cannot be read ({error}): update dreamfleet") from error
     if controller.sha256 != about["sha256"]:

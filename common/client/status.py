@@ -16,6 +16,7 @@ from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.protocol.check_counts import CheckCounts
 from dreamfleet.common.protocol.failures import describe_job
 from dreamfleet.common.protocol.host_classes import HostClasses
+from dreamfleet.common.protocol.keys import host_of
 from dreamfleet.common.protocol.messages import MAX_MESSAGE, FleetShare, HostClass
 from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, StoredEvaluation, StoredGeneration
 from dreamfleet.common.schema.display import Displayed
@@ -138,7 +139,7 @@ class WorkerStatus(Displayed):
     @property
     def name(self) -> str:
         """The worker's name, which later processes of the same worker share; `worker` is of one process alone."""
-        return self.worker.partition("/")[0]
+        return host_of(self.worker)
 
     def _display(self) -> tuple[str, dict[str, object]]:
         speed = f"{self.steps_per_second:,.0f} steps/s"

@@ -1,13 +1,17 @@
 """How much of a run was checked by other hosts, and what came of it. Pages: status.md, trust.md."""
 
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated
 
 from msgspec import Meta
 
-from dreamfleet.common.printable import plural, printable
+from dreamfleet.common.printable import plural, printable, truncate
 from dreamfleet.common.protocol.messages import Share
-from dreamfleet.common.schema.validation import OPTIONAL, Count, Text
+from dreamfleet.common.schema.validation import MAX_TEXT, OPTIONAL, Count, Text
 
 MAX_BARRED = 16  # hosts that are named
 BY_OPERATOR = " (by the operator)"  # behind the name of a host that no check found wrong
@@ -30,6 +34,22 @@ class CheckCounts:
     # Of the barred hosts, those that the operator named: no check found them wrong.
     by_operator: Annotated[tuple[Text, ...], Meta(max_length=MAX_BARRED)] = field(default=(), metadata=OPTIONAL)
     waiting: Text = field(default="", metadata=OPTIONAL)  # which hosts differ, while nobody has decided between them
+
+    @classmethod
+    def of(
+        cls, share: float, counts: Mapping[str, int], bars: Iterable[tuple[str, bool]], waiting: str = ""
+    ) -> CheckCounts | None:
+        """By the numbers of outcomes and of `recalled` results, and the barred hosts, by the operator or not.
+
+        `None` if no share is checked, nothing was, and nobody is barred. Of many hosts the last ones are named.
+        """
+        found, last = Counter(counts), [(truncate(host, MAX_TEXT), named) for host, named in [*bars][-MAX_BARRED:]]
+        if not (share or last or any(counts.values())):
+            return None
+        return cls(
+            share, found["equal"] + found["differs"], found["differs"], found["unchecked"], found["recalled"],
+            tuple(host for host, _ in last), tuple(host for host, named in last if named), truncate(waiting, MAX_TEXT),
+        )  # fmt: skip
 
     @property
     def description(self) -> str:

@@ -40,6 +40,11 @@ def is_worker_identity(identity: str) -> bool:
     return bool(_WORKER_NAME.fullmatch(name) and _PROCESS.fullmatch(process))
 
 
+def host_of(worker: str) -> str:
+    """The name in a worker's identity, without its process: its later processes, on the same host, share it."""
+    return worker.partition("/")[0]
+
+
 def new_worker_identity(name: str | None = None) -> str:
     """A new identity `<name>/<process>` of a worker process; `process` is 8 random hex digits.
 

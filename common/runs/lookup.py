@@ -28,7 +28,6 @@ from dreamfleet.common.errors import (
 from dreamfleet.common.files.regular_files import is_file, is_folder, path_exists
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.printable import plural
-from dreamfleet.common.runs.records import best_evaluation
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER, JOURNAL, resume_command, run_command, run_paths
 from dreamfleet.common.runs.run_provenance import RECEIPT, judged_facts
@@ -87,7 +86,7 @@ def load_controller_of(run: RunFolder) -> Controller:
             f"resumed: {resume_command(run.path)}"
         )
     with run.read_transaction():
-        judged = run.confirmation() or best_evaluation(run.evaluations())
+        judged = run.reported()
         if judged is None:
             return found
         provenance = found.provenance | {"generation": judged.generation, **judged_facts(judged)}
@@ -139,12 +138,8 @@ def find_evaluated_mean(name: str, runs_dir: Path, generation: int) -> tuple[Con
         if generation not in evaluated:
             known = ", ".join(map(str, evaluated)) or "none yet"
             raise JournalError(f"generation {generation} of run {name} was not evaluated; those that were: {known}")
-        spec, shape = run.spec, run.settings.controller
         provenance = {"run_uid": run.uid, "generation": generation}
-        mean = Controller(
-            shape, run.evaluated_mean(generation), spec.task, spec.bundle, provenance, spec.options, spec.world_version
-        )
-        return mean, run.bundle_path
+        return run.settings.controller_of(run.evaluated_mean(generation), provenance), run.bundle_path
 
 
 def find_bundle_of(

@@ -9,13 +9,14 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Annotated, Any, Literal, TypeVar, cast
 
 from msgspec import Meta
+from numpy.typing import NDArray
 
-from dreamfleet.common.artifacts.controller import ControllerShape
+from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.errors import JournalError
 from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.failures import Failure, FailureKind
-from dreamfleet.common.protocol.function_values import is_minimised
+from dreamfleet.common.protocol.function_values import is_minimised, value_of
 from dreamfleet.common.protocol.measures import MAX_AXES, MAX_AXIS
 from dreamfleet.common.protocol.messages import Horizon, Packages, Patience, Share, TaskSpec
 from dreamfleet.common.runs.standard_error import error_from_population_std, error_from_sample_std, format_with_error
@@ -116,6 +117,11 @@ class RunSettings:
     def is_external(self) -> bool:
         """Whether the run has no search of its own: others submit its candidates in batches."""
         return self.optimiser == EXTERNAL
+
+    def controller_of(self, parameters: NDArray[Any], provenance: dict[str, Any]) -> Controller:
+        """A controller of this run with these parameters, which come from there."""
+        about = self.task.task, self.task.bundle, provenance, self.task.options, self.task.world_version
+        return Controller(self.controller, parameters, *about)
 
     def to_json(self) -> str:
         """The text in the journal."""
@@ -241,7 +247,7 @@ class StoredEvaluation:
     @property
     def rank(self) -> tuple[int, float]:
         """The greater, the better: a mean over the episodes that are easy enough not to fail would flatter."""
-        return -self.failed, self.mean
+        return -self.failed, self.mean  # as `Journal.finalists` and `Confirmation` choose among means
 
     @property
     def is_sound(self) -> bool:
@@ -360,7 +366,6 @@ def in_values(found: S, task: TaskSpec) -> S:
     """A record with the function's values in place of fitness: `best` is then the smallest one of a minimised one."""
     if found is None or not is_minimised(task):
         return found
-    if isinstance(found, StoredGeneration):
-        own = {name: 0.0 - getattr(found, name) for name in ("mean", "best", "worst")}
-        return cast(S, replace(found, **own))
-    return cast(S, replace(found, mean=0.0 - found.mean))
+    names = ("mean", "best", "worst") if isinstance(found, StoredGeneration) else ("mean",)
+    own: dict[str, Any] = {name: value_of(getattr(found, name), task) for name in names}
+    return cast(S, replace(found, **own))

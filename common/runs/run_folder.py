@@ -169,7 +169,7 @@ class RunFolder:
 
     @property
     def checks(self) -> CheckCounts | None:
-        """What came of checking results on other hosts; `None` if nothing was checked and nobody is barred."""
+        """What came of checking results on other hosts; `None` if nothing is checked and nobody is barred."""
         try:
             share = float(json.loads(self.fact("network") or "{}").get("verify", 0.0))
         except (ValueError, TypeError, AttributeError):
@@ -335,6 +335,10 @@ class RunFolder:
             return None
         found = StoredConfirmation.from_json(text)
         return found if found.covers(best_evaluation(evaluations)) else None
+
+    def reported(self) -> StoredConfirmation | StoredEvaluation | None:
+        """The score of the mean that the run reports: the confirmed one, else the best evaluation."""
+        return self.confirmation() or best_evaluation(self.evaluations())
 
     def efforts(self) -> list[GenerationEffort]:
         """The steps and time of accepted results by generation; choosing and confirming the report is separate."""

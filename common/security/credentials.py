@@ -21,7 +21,7 @@ from msgspec import Meta
 
 from dreamfleet.common.errors import AccessError
 from dreamfleet.common.files.regular_files import open_regular
-from dreamfleet.common.protocol.keys import check_worker_name
+from dreamfleet.common.protocol.keys import check_worker_name, host_of
 from dreamfleet.common.schema.validation import OPTIONAL, MalformedError, from_plain
 
 VERSION = 1
@@ -105,7 +105,7 @@ def worker_seat_identity(worker: str) -> str:
     >>> worker_seat_identity("gpu.1/0badc0de"), worker_seat_identity("gpu.coordinator-2/0badc0de")
     ('worker.1', 'coordinator.2')
     """
-    seat = worker.partition("/")[0].rpartition(".")[2]
+    seat = host_of(worker).rpartition(".")[2]
     return seat.replace("-", ".") if "-" in seat else f"worker.{seat}"  # a worker's name must end in a number
 
 

@@ -5,6 +5,7 @@ from collections.abc import Collection, Iterator, Sequence
 from typing import Literal, NamedTuple
 
 from dreamfleet.common.client.status import EventKind
+from dreamfleet.common.protocol.keys import host_of
 from dreamfleet.common.protocol.messages import Job
 
 MAX_EVENTS = 32_768  # that are kept: a view copies their list in some 0.1 ms; docs/how-to/watch.md
@@ -68,7 +69,7 @@ def latest(
 ) -> Iterator[FleetEvent]:
     """Events from the newest to the oldest, filtered by worker or host name, by candidate and by kind."""
     for each in reversed(events):
-        is_of_worker = not worker or worker in (each.worker, each.worker.partition("/")[0])
+        is_of_worker = not worker or worker in (each.worker, host_of(each.worker))
         is_of_job = job is None or (each.job is not None and each.job[1:3] == job)
         if is_of_worker and is_of_job and (not kinds or each.what in kinds):
             yield each

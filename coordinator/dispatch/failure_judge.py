@@ -3,7 +3,8 @@
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 
-from dreamfleet.coordinator.dispatch.failures import Attempt, host_of
+from dreamfleet.common.protocol.keys import host_of
+from dreamfleet.coordinator.dispatch.failures import Attempt
 from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob, PendingJobs
 

@@ -3,15 +3,11 @@
 from dataclasses import dataclass
 
 from dreamfleet.common.protocol.failures import Failure
+from dreamfleet.common.protocol.keys import host_of
 
 LONGEST_ERROR = 300  # characters of a worker's error that are shown
 LONGEST_PAUSE = 120.0  # seconds between two attempts; HOST_ATTEMPTS in failure_judge.py reckons with it
 WORKER_ENDED = Failure.of_host("its worker was lost")
-
-
-def host_of(worker: str) -> str:
-    """A worker's name without its process: attempts on one host are less independent than on two."""
-    return worker.partition("/")[0]
 
 
 @dataclass(frozen=True)
@@ -23,7 +19,7 @@ class Attempt:
 
     @property
     def host(self) -> str:
-        """The name of its host."""
+        """The name of its host: attempts on one are less independent than on two."""
         return host_of(self.worker)
 
 

@@ -13,10 +13,10 @@ from msgspec.structs import replace
 
 from dreamfleet.common.client.status import EventKind
 from dreamfleet.common.printable import plural
+from dreamfleet.common.protocol.keys import host_of
 from dreamfleet.common.protocol.messages import MAX_SLOTS, Heartbeat, Result, Verdict, VerdictWord
 from dreamfleet.coordinator.dispatch.event_log import EventLog, Note, NoteKind
 from dreamfleet.coordinator.dispatch.failure_judge import FailureJudge
-from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.dispatch.host_stats import HostRecords
 from dreamfleet.coordinator.dispatch.leases import Leases
 from dreamfleet.coordinator.dispatch.member import DepartedWorkers, DispatchGroup, Member, MemberState
@@ -28,7 +28,7 @@ from dreamfleet.coordinator.jobs.checks import Check
 from dreamfleet.coordinator.jobs.scoring_job import ScoringJob
 
 DEPARTURE_GRACE = 0.05  # seconds: a vanished token overtakes results that are still on their way
-CLOCK_GAP = 2.0  # seconds between ticks that mean that this host was suspended
+CLOCK_GAP = 2.0  # seconds between ticks that mean that this host was suspended; as worker/service/run_session.py
 # In heartbeat intervals:
 SILENT_AFTER = 5  # without a message a worker counts as silent
 ALIVE_WITHIN = 2  # of its last message a worker is surely alive

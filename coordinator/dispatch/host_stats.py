@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
+from dreamfleet.common.protocol.keys import host_of
 from dreamfleet.common.protocol.messages import Kind
 
 UNKNOWN_LINK = 32_000.0  # bytes a second: assumed of a link before the first measurement
@@ -166,7 +167,7 @@ class HostRecords:
 
     def join(self, identity: str, current: HostStats | None) -> HostStats:
         """The record for a worker that joins: its `current` one, else a copy of its host's, else an empty one."""
-        name = identity.partition("/")[0]
+        name = host_of(identity)
         last = self._records.pop(name, None)
         host_stats = current or (last.copy() if last else HostStats())
         self._records[name] = host_stats
@@ -176,7 +177,7 @@ class HostRecords:
 
     def get(self, identity: str) -> HostStats | None:
         """The record of a worker's host."""
-        return self._records.get(identity.partition("/")[0])
+        return self._records.get(host_of(identity))
 
 
 def _size_class(jobs: int) -> int:

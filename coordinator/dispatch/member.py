@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 
 from dreamfleet.common.printable import one_line
+from dreamfleet.common.protocol.keys import host_of
 from dreamfleet.common.protocol.messages import MAX_LEASES, MAX_SIDE_BY_SIDE, Heartbeat, Job, Result, Verdict
 from dreamfleet.coordinator.dispatch.host_stats import HostStats
 from dreamfleet.coordinator.dispatch.packing import SentBatch
@@ -357,8 +358,7 @@ class DepartedWorkers(dict[str, Member]):
 
     def remove(self, identity: str) -> None:
         """Unlist a worker that is back; else one of the same host, of which this is another process."""
-        host = identity.partition("/")[0]
-        others = (name for name in self if name.partition("/")[0] == host)
+        others = (name for name in self if host_of(name) == host_of(identity))
         self.pop(identity if identity in self else next(others, ""), None)
 
     def expire(self, now: float) -> None:

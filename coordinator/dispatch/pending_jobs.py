@@ -8,9 +8,10 @@ from enum import Enum, auto
 
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol.failures import Failure, describe_job
+from dreamfleet.common.protocol.keys import host_of
 from dreamfleet.common.protocol.messages import TAG_BYTES, Kind, Result
 from dreamfleet.coordinator.dispatch.deficit_round_robin import DeficitCounter
-from dreamfleet.coordinator.dispatch.failures import LONGEST_ERROR, WORKER_ENDED, Attempt, host_of, pause_before_retry
+from dreamfleet.coordinator.dispatch.failures import LONGEST_ERROR, WORKER_ENDED, Attempt, pause_before_retry
 from dreamfleet.coordinator.jobs.checks import Check
 from dreamfleet.coordinator.jobs.scoring_job import ScoringJob
 

@@ -6,7 +6,7 @@ from dreamfleet.common.host.fingerprint import NUMERIC_PACKAGES
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol.host_classes import effective_class
-from dreamfleet.common.protocol.keys import PROTOCOL_VERSION
+from dreamfleet.common.protocol.keys import PROTOCOL_VERSION, host_of
 from dreamfleet.common.protocol.messages import HelloRequest
 from dreamfleet.common.protocol.tasks import ARGUMENTS, is_unregistered, module_of
 
@@ -85,7 +85,7 @@ class RefusedWorkers:
 
         R26: both the remembered names and the logged refusals are bounded.
         """
-        name, why = worker.partition("/")[0], truncate(why, 2 * LONGEST)
+        name, why = host_of(worker), truncate(why, 2 * LONGEST)
         news = self.latest.pop(name, None) != why and self._logged < MAX_LOGGED
         self._logged += news
         self.latest[name] = why
@@ -95,4 +95,4 @@ class RefusedWorkers:
 
     def remove(self, worker: str) -> None:
         """Forget a worker that could join after all."""
-        self.latest.pop(worker.partition("/")[0], None)
+        self.latest.pop(host_of(worker), None)

@@ -10,7 +10,7 @@ import math
 from collections.abc import Collection, Mapping
 from functools import cached_property
 
-from dreamfleet.coordinator.dispatch.failures import host_of
+from dreamfleet.common.protocol.keys import host_of
 from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob, PendingJobs
 from dreamfleet.coordinator.jobs.checks import Check

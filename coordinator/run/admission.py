@@ -4,12 +4,12 @@ from collections.abc import Collection
 
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.protocol.host_classes import effective_class
+from dreamfleet.common.protocol.keys import host_of
 from dreamfleet.common.protocol.messages import HelloRequest
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.security.credentials import worker_seat_identity
 from dreamfleet.common.security.host_key import is_token_of
 from dreamfleet.coordinator.dispatch.event_log import Note
-from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.refusals import Refusal, RefusedWorkers, class_mismatch, find_refusal

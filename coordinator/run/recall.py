@@ -9,12 +9,12 @@ from pathlib import Path
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import plural, printable
+from dreamfleet.common.protocol.keys import host_of
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.runs.run_paths import CONTROLLER
 from dreamfleet.common.runs.seeds import training_seeds
 from dreamfleet.common.runs.stages import StageTracker
-from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.jobs.history import History
 from dreamfleet.coordinator.jobs.rollout_collection import RolloutCollections
 from dreamfleet.coordinator.run.failure_policy import forget_acceptance

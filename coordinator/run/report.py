@@ -44,10 +44,7 @@ class ReportedMean:
             "steps": self.steps,
         }
         parameters = np.frombuffer(self.vector, dtype="<f4").astype(np.float32)
-        spec = self.settings.task
-        return Controller(
-            self.settings.controller, parameters, spec.task, spec.bundle, provenance, spec.options, spec.world_version
-        )
+        return self.settings.controller_of(parameters, provenance)
 
 
 class ControllerWriter:  # docs/explanation/decisions.md

@@ -12,14 +12,15 @@ from msgspec.structs import replace
 
 from dreamfleet.common.errors import NotWritableNowError
 from dreamfleet.common.printable import truncate
+from dreamfleet.common.protocol.keys import host_of
 from dreamfleet.common.protocol.messages import Job, Result
 from dreamfleet.common.protocol.stop_kind import PauseKind, StopReason
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_folder import EPISODE_LIMIT
 from dreamfleet.common.runs.stages import StageTracker
 from dreamfleet.coordinator.dispatch.event_log import Note
-from dreamfleet.coordinator.dispatch.failures import LONGEST_ERROR, host_of
-from dreamfleet.coordinator.dispatch.fleet import Fleet
+from dreamfleet.coordinator.dispatch.failures import LONGEST_ERROR
+from dreamfleet.coordinator.dispatch.fleet import CLOCK_GAP, Fleet
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.history import History
@@ -39,7 +40,6 @@ from dreamfleet.coordinator.storage.journal import Journal
 
 PAUSED = "paused"  # the fact that somebody paused the run
 BY_HAND = Pause(PauseKind.BY_HAND, "by hand")  # docs/reference/status.md
-LONGEST_TICK = 2.0  # seconds between ticks; a longer gap means that this process was suspended
 WRITE_RETRY = 2.0  # seconds until a full disk or a locked journal is tried again
 
 
@@ -117,7 +117,7 @@ class Run:
         since, self._now = self._now, now
         self.fleet.tick(now)
         if self.generation.population and self.state.gives_jobs and self.fleet.has_workers:
-            self.open_seconds += min(now - since, LONGEST_TICK)
+            self.open_seconds += min(now - since, CLOCK_GAP)
         self.background_jobs.rollout_collections.uploads.tick(now)
 
     def advance(self, now: float) -> bool:

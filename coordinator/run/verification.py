@@ -10,12 +10,11 @@ import hmac
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from dreamfleet.common.printable import printable, truncate
-from dreamfleet.common.protocol.check_counts import MAX_BARRED, CheckCounts
+from dreamfleet.common.printable import printable
+from dreamfleet.common.protocol.check_counts import CheckCounts
 from dreamfleet.common.protocol.failures import describe_job
+from dreamfleet.common.protocol.keys import host_of
 from dreamfleet.common.protocol.messages import Job, Result
-from dreamfleet.common.schema.validation import MAX_TEXT
-from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.dispatch.fleet import Fleet
 from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob
@@ -72,17 +71,8 @@ class Verification:
     @property
     def summary(self) -> CheckCounts | None:
         """What came of it so far; `None` if nothing is checked and nobody is barred."""
-        counts, bars = self.counts, self._admission.barred
-        barred = tuple(bars)[-MAX_BARRED:]
-        if not (self.share or barred or any(counts.values())):
-            return None
-        checked = counts["equal"] + counts["differs"]
-        return CheckCounts(
-            self.share, checked, counts["differs"], counts["unchecked"], counts["recalled"],
-            tuple(truncate(each, MAX_TEXT) for each in barred),
-            tuple(truncate(each, MAX_TEXT) for each in barred if bars[each].by_operator),
-            truncate(self.waiting, MAX_TEXT),
-        )  # fmt: skip
+        bars = ((host, bar.by_operator) for host, bar in self._admission.barred.items())
+        return CheckCounts.of(self.share, self.counts, bars, self.waiting)
 
     @property
     def holds_generation(self) -> bool:

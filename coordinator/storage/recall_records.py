@@ -5,6 +5,7 @@ from collections.abc import Collection, Iterable, Sequence
 from itertools import groupby
 from time import time
 
+from dreamfleet.common.protocol.keys import host_of
 from dreamfleet.common.runs.journal.journal_reader import digest_terms
 from dreamfleet.common.runs.run_folder import CONFIRMED, ENDED_AT, ENDING, STOP_KIND
 from dreamfleet.common.runs.seeds import CHOOSING_OFFSET
@@ -148,7 +149,7 @@ class RecallRecords:
         return [
             (digest, kind, generation)
             for digest, kind, generation, workers in rows
-            if set(hosts) & {each.partition("/")[0] for each in workers.split(",")}
+            if set(hosts) & {*map(host_of, workers.split(","))}
         ]
 
     def _confirmed_by(self, hosts: Collection[str]) -> list[tuple[bytes, str, int]]:

@@ -18,7 +18,7 @@ from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.protocol.stop_kind import StopKind, StopReason
-from dreamfleet.common.runs.records import StoredGeneration, best_evaluation
+from dreamfleet.common.runs.records import StoredGeneration
 from dreamfleet.common.runs.run_paths import default_runs_dir, run_command
 from dreamfleet.common.schema.display import Displayed
 from dreamfleet.experiments.local.function_names import is_noisy, name_function
@@ -373,14 +373,10 @@ class _Searches:
         self._failed += failed
 
     def _read_means(self, run: StartedRun, objective: Objective) -> None:
-        """Keep the best evaluated mean of all runs, by its confirmed score if it has one."""
-        best = best_evaluation(run.evaluations())
-        if best is None:
-            return
-        confirmed = run.confirmation()
-        fitness = best.mean if confirmed is None else confirmed.mean
-        if self._favorite is None or fitness > self._favorite[0]:
-            self._favorite = fitness, objective.decode(run.evaluated_mean(best.generation))
+        """Keep the best of the means that the runs report, each by its own score."""
+        found = run.reported()
+        if found is not None and (self._favorite is None or found.mean > self._favorite[0]):
+            self._favorite = found.mean, objective.decode(run.evaluated_mean(found.generation))
 
     def _result(self, reason: StopReason) -> SearchResult:
         if self._best is None:

@@ -13,11 +13,11 @@ from unittest.mock import patch
 import numpy as np
 
 from dreamfleet.common.protocol.failures import Failure
+from dreamfleet.common.protocol.keys import host_of
 from dreamfleet.common.protocol.messages import Job, Result
 from dreamfleet.common.runs.journal import schema
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_paths import JOURNAL
-from dreamfleet.coordinator.dispatch.failures import host_of
 from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.coordinator.storage.verification_records import VERIFY_KEY
 from tests.simulation.violation import Violation

@@ -6,6 +6,7 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.failures import Failure, describe_job
 from dreamfleet.common.protocol.messages import Job
 from dreamfleet.worker.scoring.failure_cause import encodable, failure_of
@@ -57,15 +58,14 @@ class FailureLog:
             return None
         self._logged_kinds.add(failure.kind)
         return (
-            f"task {task}: {failure.error.text} ({_describe_jobs(jobs)}); later failures from this line are not "
-            f"logged\n"
-            f"{failure.trace}"
+            f"task {task}: {failure.error.text}{describe_jobs(jobs) or ' as a slot started'}; later failures from this "
+            f"line are not logged\n{failure.trace}"
         ).rstrip()
 
 
-def _describe_jobs(jobs: Sequence[Job]) -> str:
+def describe_jobs(jobs: Sequence[Job]) -> str:
+    """Which jobs failed, in words; empty: none was scored."""
     if not jobs:
-        return "as a slot started"
-    job = jobs[0]
-    more = f", or one of {len(jobs) - 1} jobs scored with it" if len(jobs) > 1 else ""
-    return f"{describe_job(job.kind, job.generation, job.candidate, job.seeds)}{more}"
+        return ""
+    first, more = jobs[0], f", and {plural(len(jobs) - 1, 'job')} scored with it" if len(jobs) > 1 else ""
+    return f" at {describe_job(first.kind, first.generation, first.candidate, first.seeds)}{more}"

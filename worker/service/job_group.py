@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dreamfleet.common.printable import plural
-from dreamfleet.common.protocol.failures import describe_job
 from dreamfleet.common.protocol.measures import LARGEST_MEASURE
 from dreamfleet.common.protocol.messages import MAX_SIDE_BY_SIDE, MAX_UPLOAD, Job, Result, TaskSpec
 from dreamfleet.common.protocol.result_bounds import LONGEST_EPISODE, clamp_count, rejection_reason
@@ -74,14 +73,6 @@ class GroupDone:
     results: tuple[Result, ...]
     upload: bytes | None = None
     failure: ScoringFailure | None = None
-
-
-def describe_jobs(jobs: list[Job]) -> str:
-    """Which jobs failed, in words."""
-    if not jobs:
-        return ""
-    first, more = jobs[0], f" and {len(jobs) - 1} more" if len(jobs) > 1 else ""
-    return f" at {describe_job(first.kind, first.generation, first.candidate, first.seeds)}{more}"
 
 
 class AbandonedError(Exception):

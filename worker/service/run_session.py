@@ -35,7 +35,7 @@ from dreamfleet.worker.service.wording import describe_failure
 log = logging.getLogger(__name__)
 MAX_WAITING_BATCHES = 1024  # R26: more batches are dropped unread; the coordinator sends unconfirmed ones again
 RETRY = 1.0  # seconds between two hellos, about
-CLOCK_GAP = 2.0  # seconds between two passes of the loop that mean that the host was suspended
+CLOCK_GAP = 2.0  # seconds between two passes of the loop that mean that the host was suspended; as dispatch/fleet.py
 
 Events = queue.SimpleQueue[tuple[str, Any]]
 

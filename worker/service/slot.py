@@ -16,9 +16,9 @@ from dreamfleet.common.protocol.messages import Job, Result
 from dreamfleet.worker.scoring.failure_cause import is_hosts_fault
 from dreamfleet.worker.service.child import ChildReady, ScorerArguments
 from dreamfleet.worker.service.child_process import EXIT_GRACE, LOOK_INTERVAL, ChildMessage, ChildProcess
-from dreamfleet.worker.service.failure_log import ScoringFailure
+from dreamfleet.worker.service.failure_log import ScoringFailure, describe_jobs
 from dreamfleet.worker.service.frame_sampler import SampledFrame
-from dreamfleet.worker.service.job_group import GroupDone, JobGroup, JobWithVector, describe_jobs
+from dreamfleet.worker.service.job_group import GroupDone, JobGroup, JobWithVector
 
 log = logging.getLogger(__name__)
 FAILED_STARTS = 3  # failed starts in a row that end the worker (docs/how-to/monitor.md)

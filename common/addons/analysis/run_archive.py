@@ -124,12 +124,8 @@ class RunArchive(EliteArchive):
 
 def controller_of(run: RunFolder, elite: Elite) -> Controller:
     """An elite as a controller, with where it comes from."""
-    spec = run.spec
     provenance = {"run_uid": run.uid, "generation": elite.generation, "candidate": elite.candidate}
-    parameters = run.candidate(elite.generation, elite.candidate)
-    return Controller(
-        run.settings.controller, parameters, spec.task, spec.bundle, provenance, spec.options, spec.world_version
-    )
+    return run.settings.controller_of(run.candidate(elite.generation, elite.candidate), provenance)
 
 
 def find_elite(runs_dir: Path, name: str, cell: str) -> tuple[Controller, Path, str]:

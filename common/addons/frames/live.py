@@ -175,9 +175,7 @@ class LiveView:
     def _choose_worker(self) -> str | None:
         """The wanted worker, or the busiest one; `None` if there is none."""
         name = self._wanted
-        found = [
-            each for each in self._present_workers() if name is None or name in (each.worker, each.worker.split("/")[0])
-        ]
+        found = [each for each in self._present_workers() if name in (None, each.worker, each.name)]
         return max(found, key=lambda each: each.leases).worker if found else None
 
     def _present_workers(self) -> list[WorkerStatus]:

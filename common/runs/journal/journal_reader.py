@@ -13,7 +13,7 @@ from dreamfleet.common.files.file_system import disk_problem, lock_problem
 from dreamfleet.common.files.regular_files import check_regular
 from dreamfleet.common.files.sqlite import ThreadConnections, is_damage, is_locked
 from dreamfleet.common.printable import one_line
-from dreamfleet.common.protocol.check_counts import MAX_BARRED, CheckCounts
+from dreamfleet.common.protocol.check_counts import CheckCounts
 from dreamfleet.common.runs.journal import schema
 from dreamfleet.common.runs.seeds import CHOOSING_OFFSET
 from dreamfleet.common.runs.stages import BegunStage
@@ -75,17 +75,10 @@ class JournalReader:
         return None if row is None else str(row[0])
 
     def check_counts(self, share: float) -> CheckCounts | None:
-        """Outcomes of checking the `share` of results; `None` if nothing was checked and nobody is barred."""
+        """Outcomes of checking the `share` of results; `None` if nothing is checked and nobody is barred."""
         counts = dict(self.rows("si", "SELECT outcome, count(*) FROM verification GROUP BY 1"))
-        barred = self.rows("si", "SELECT host, by_operator FROM barred ORDER BY happened")[-MAX_BARRED:]
-        (recalled,) = self.row("SELECT count(*) FROM recalled WHERE because = 'barred'")
-        if not (counts or barred or recalled):
-            return None
-        differing = counts.get("differs", 0)
-        return CheckCounts(
-            share, counts.get("equal", 0) + differing, differing, counts.get("unchecked", 0), recalled,
-            tuple(host for host, _ in barred), tuple(host for host, named in barred if named),
-        )  # fmt: skip
+        (counts["recalled"],) = self.row("SELECT count(*) FROM recalled WHERE because = 'barred'")
+        return CheckCounts.of(share, counts, self.rows("si", "SELECT host, by_operator FROM barred ORDER BY happened"))
 
     def damage_error(self, what: str) -> DamagedJournalError:
         """The error for a damaged journal."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.printable import printable
+from dreamfleet.common.protocol.keys import host_of
 from dreamfleet.common.runs.records import StoredEvent, WorkerEffort
 
 BINS = 120  # of the run's time
@@ -26,7 +27,7 @@ _CAME, _GONE = ("joined", "back"), ("silent", "lost", "left")  # what becomes of
 
 @dataclass
 class _Host:
-    lives: set[str] = field(default_factory=set)
+    lives: set[str] = field(default_factory=set)  # workers: processes of its name
     results: int = 0
     steps: float = 0.0
     seconds: float = 0.0
@@ -47,16 +48,15 @@ def host_history(
     hosts: dict[str, _Host] = {}
     spans = _Spans(work, times, end)
     for each in work:
-        name, _, life = each.worker.rpartition("/")
-        host = hosts.setdefault(name or life, _Host())
-        host.lives.add(life)
+        host = hosts.setdefault(host_of(each.worker), _Host())
+        host.lives.add(each.worker)
         host.results += each.results
         host.steps += each.steps
         host.seconds += each.seconds
         host.binned_steps += each.steps * _shares(*spans(each), since, width)
-    for name, life, came, went in _stays(events, sorted(moments), end):
-        host = hosts.setdefault(name, _Host())
-        host.lives.add(life)
+    for worker, came, went in _stays(events, sorted(moments), end):
+        host = hosts.setdefault(host_of(worker), _Host())
+        host.lives.add(worker)
         host.present.append((came, went))
     ordered = sorted(hosts.items(), key=lambda each: (-each[1].steps, each[0]))
     return {
@@ -101,26 +101,22 @@ def _shares(began: float, ended: float, since: float, width: float) -> NDArray[n
     return inside.clip(0.0) / (last - first)
 
 
-def _stays(
-    events: Sequence[StoredEvent], moments: Sequence[float], end: float
-) -> Iterator[tuple[str, str, float, float]]:
-    """From when to when each worker was there: its host, its life, and both moments."""
-    here: dict[tuple[str, str], float] = {}
+def _stays(events: Sequence[StoredEvent], moments: Sequence[float], end: float) -> Iterator[tuple[str, float, float]]:
+    """From when to when each worker was there."""
+    here: dict[str, float] = {}
     incarnation = None
     for each in events:
         if each.incarnation != incarnation:  # its coordinator ended: the last sign of it is what the journal has
             incarnation = each.incarnation
             last = moments[max(bisect_left(moments, each.happened) - 1, 0)]
-            yield from ((*worker, came, max(last, came)) for worker, came in here.items())
+            yield from ((worker, came, max(last, came)) for worker, came in here.items())
             here.clear()
-        name, _, life = each.worker.partition("/")
-        worker = name, life
         if each.what in _CAME:
-            here.setdefault(worker, each.happened)
-        elif each.what in _GONE and worker in here:
-            came = here.pop(worker)
-            yield *worker, came, max(each.happened, came)
-    yield from ((*worker, came, max(end, came)) for worker, came in here.items())
+            here.setdefault(each.worker, each.happened)
+        elif each.what in _GONE and each.worker in here:
+            came = here.pop(each.worker)
+            yield each.worker, came, max(each.happened, came)
+    yield from ((worker, came, max(end, came)) for worker, came in here.items())
 
 
 def _covered(present: Sequence[tuple[float, float]]) -> float:

@@ -111,8 +111,9 @@ def run_facts(run: RunFolder) -> dict[str, Any]:
     if (network := run.fact("network")) not in (None, "{}"):  # a resumed run listens where a stranger's journal says
         facts["network"] = network
     if is_function_task(settings.task.task):
-        best = best_evaluation(run.evaluations())
-        facts |= _function_facts(None if best is None else run.evaluated_mean(best.generation), settings.task.options)
+        judged = run.reported()
+        mean = None if judged is None else run.evaluated_mean(judged.generation)
+        facts |= _function_facts(mean, settings.task.options)
     if (archive := RunArchive.of(run)) is not None:
         facts["archive found"] = archive.description
     if settings.stages:

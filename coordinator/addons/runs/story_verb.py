@@ -15,6 +15,7 @@ from dreamfleet.common.client.status import EventKind
 from dreamfleet.common.errors import ConnectionFailedError, UsageError
 from dreamfleet.common.files.regular_files import is_file
 from dreamfleet.common.printable import join_some
+from dreamfleet.common.protocol.keys import host_of
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
 
@@ -117,7 +118,7 @@ def _check_known(client: Client, run: str, worker: str) -> None:
     """`UsageError` with the known names, unless `name` is a worker's or a host's."""
     events, _ = client.events(run)  # of those that are gone, too
     known = [*(each.worker for each in client.workers(run)), *(each.worker for each in events)]
-    hosts = list(dict.fromkeys(each.partition("/")[0] for each in known))
+    hosts = list(dict.fromkeys(host_of(each) for each in known))
     if worker in (*known, *hosts):
         return
     there = f"known are {join_some(hosts, MOST_NAMED)}" if hosts else "none has joined"

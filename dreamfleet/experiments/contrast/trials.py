@@ -11,7 +11,7 @@ from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.regular_files import is_folder, path_exists
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.host.stop_signals import Stop
-from dreamfleet.common.runs.records import best_evaluation
+from dreamfleet.common.runs.records import StoredConfirmation
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.schema.validation import from_plain, to_plain
 from dreamfleet.experiments.contrast.config import Contrast, Trial
@@ -123,10 +123,8 @@ class Trials:
         figures = {name: float(value) for name, value in quality.items() if isinstance(value, (int, float))}
         trained = TrialResult(trial.kind, trial.seed, self._parameters[trial], figures)
         with open_run(self._runs, trial.name) as run:
-            confirmed = run.confirmation()
-            judged = confirmed or best_evaluation(run.evaluations())
+            judged = run.reported()
         if judged is None:
             return trained
-        return replace(
-            trained, score=judged.mean, error=judged.error, tracks=judged.episodes, confirmed=confirmed is not None
-        )
+        is_confirmed = isinstance(judged, StoredConfirmation)
+        return replace(trained, score=judged.mean, error=judged.error, tracks=judged.episodes, confirmed=is_confirmed)

@@ -18,7 +18,7 @@ from dreamfleet.common.files.atomic_write import atomic_write
 from dreamfleet.common.files.regular_files import path_exists
 from dreamfleet.common.host.stop_signals import Stop
 from dreamfleet.common.runs.lookup import find_bundle_of, find_controller, load_controller_of
-from dreamfleet.common.runs.records import StoredEvaluation, best_evaluation
+from dreamfleet.common.runs.records import StoredConfirmation, StoredEvaluation
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import BUNDLE as RUN_BUNDLE
 from dreamfleet.experiments.iteration import artefacts, gate, plan
@@ -261,16 +261,16 @@ def other_means(evaluations: Sequence[StoredEvaluation], reported: int | None, c
     """
     last = max((each.generation for each in evaluations), default=None)
     others = [each for each in evaluations if each.generation != reported]
-    others.sort(key=lambda each: (each.generation != last, -each.mean, each.generation))
+    others.sort(key=lambda each: (each.generation == last, each.rank), reverse=True)  # of equals the first stays so
     return [each.generation for each in others[:count]]
 
 
 def _describe_run(run: RunFolder) -> dict[str, Any]:
-    history, confirmed, score = run.history(), run.confirmation(), None
-    if (judged := confirmed or best_evaluation(run.evaluations())) is not None:
+    history, score = run.history(), None
+    if (judged := run.reported()) is not None:
         word = Bundle.open(run.bundle_path, run.spec.bundle).manifest.world.score_word
         score = {"mean": judged.mean, "error": judged.error, "word": word, "generation": judged.generation,
-                 "episodes": judged.episodes, "confirmed": confirmed is not None}  # fmt: skip
+                 "episodes": judged.episodes, "confirmed": isinstance(judged, StoredConfirmation)}  # fmt: skip
     steps = sum(each.steps for each in history)
     return {"run": run.name, "ended": run.ended, "generations": len(history), "steps": steps, "score": score}
 

@@ -35,6 +35,8 @@ def test_the_last_mean_and_the_best_evaluated_ones_drive_beside_the_reported_one
     assert other_means(seen, 19, 2) == [9, 4]
     assert other_means(seen, None, 9) == [19, 9, 4, 14]
     assert other_means(seen, 4, 0) == other_means([], None, 3) == []
+    easy = StoredEvaluation(2, 3, 9.0, 1.0, failed=1)
+    assert other_means([easy, *seen], 19, 2) == [9, 4], "a mean over the episodes that did not fail flatters"
 
 
 def test_a_run_whose_workers_all_failed_is_not_waited_for(tmp_path):

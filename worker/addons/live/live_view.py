@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.addons.frames.live import LiveFrame
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.printable import plural, truncate
+from dreamfleet.common.protocol.keys import host_of
 from dreamfleet.common.worlds.score_words import profile_of
 from dreamfleet.worker.addons.recording.canvas import BACKGROUND, FAINT, Board, Frame, pixels
 from dreamfleet.worker.addons.recording.parallel_dream import DreamContinuation
@@ -125,7 +126,7 @@ class LiveCanvas(Board):
         whose = f"candidate {frame.candidate}" if frame.kind == "score" else "its mean, in reality"
         lines = [
             f"generation {frame.generation}, {whose}",
-            f"run {truncate(self._run, NAME)}   worker {truncate(live.worker.partition('/')[0], NAME)}",
+            f"run {truncate(self._run, NAME)}   worker {truncate(host_of(live.worker), NAME)}",
             f"step {frame.step}   {self._profile.score_word} {frame.seed}",
         ]
         self._draw_score(self._profile.score_label, self._profile.format_amount(frame.reward), (EDGE, FOOT))

@@ -32,6 +32,12 @@ def test_steps_count_evenly_over_the_time_of_their_generation():
     assert (only(found)["results"], only(found)["steps"], only(found)["seconds"]) == (12, 1800.0, 60.0)
 
 
+def test_a_worker_that_came_and_worked_is_one_whatever_its_name():
+    for worker in ("desk/0a", "desk"):
+        found = host_history([work(worker)], TIMES, [joined(worker)], None)
+        assert (only(found)["host"], only(found)["lives"]) == ("desk", 1)
+
+
 def test_no_step_is_lost_whatever_the_clocks_said():
     times = {0: (1000.0, 900.0), 1: (1e9, None), 2: (5.0, 7.0)}
     rows = [work(generation=each, kind=kind) for each in (0, 1, 2, 7) for kind in ("score", "evaluate", "collect")]

@@ -33,12 +33,19 @@ from dreamfleet.common.addons.analysis.learning import LearningCurve, Point
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.client.equal_fitness import ENOUGH, EqualFitness
+from dreamfleet.common.protocol.check_counts import CheckCounts
 from dreamfleet.common.protocol.function_values import value_of
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC
 from dreamfleet.common.runs.effort import START_EFFORT, Effort
 from dreamfleet.common.runs.episode_results import EpisodeResult
-from dreamfleet.common.runs.records import StageSettings, StoredEvaluation, StoredGeneration, in_values
-from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.common.runs.records import (
+    StageSettings,
+    StoredEvaluation,
+    StoredGeneration,
+    best_evaluation,
+    in_values,
+)
+from dreamfleet.common.runs.run_folder import CONFIRMED, RunFolder
 from dreamfleet.common.runs.run_paths import CONTROLLER, resume_command
 from dreamfleet.common.runs.run_provenance import RECEIPT, RunProvenance, StartProvenance
 from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, VALIDATION, training_seeds
@@ -49,6 +56,7 @@ from dreamfleet.coordinator.addons.dashboard.stored_runs import describe_run, li
 from dreamfleet.coordinator.addons.runs import run_details
 from dreamfleet.coordinator.addons.runs.plot import fitness_figure, learning_figure, save_figure
 from dreamfleet.coordinator.addons.status.status_panel import panel_lines
+from dreamfleet.experiments.minimise import _Searches
 from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
 from dreamfleet.worker.addons.evaluation.known_score import find_known_score
 from dreamfleet.worker.addons.verification.candidate_verb import _in_values
@@ -291,6 +299,45 @@ def test_the_verbs_print_values_and_json_has_fitness(minimised):
     assert rows["reality"]["mean"] == -1.0
     assert "-1,000" not in printed("runs", "show", "reality")
     printed("compare", "reality", "hidden")
+
+
+@pytest.fixture
+def confirmed_another(minimised):
+    """A run of a function whose confirmed mean is not the one that was evaluated best, and that mean's generation."""
+    path = minimised / "reality"
+    change_journal(path, "DELETE FROM run WHERE key = ?", CONFIRMED)
+    with RunFolder(path) as run:
+        best = best_evaluation(run.evaluations())
+        other = next(each for each in run.evaluations() if each.generation != best.generation)
+        assert not np.array_equal(run.evaluated_mean(best.generation), run.evaluated_mean(other.generation))
+        closed = len(run.history())
+    confirm(path, other.generation, 8, -3.0, 1.0, closed)
+    with RunFolder(path) as run:
+        yield run, other.generation
+
+
+def test_the_reported_arguments_are_those_of_the_reported_value(confirmed_another):
+    run, generation = confirmed_another
+    wanted = Objective.parse(OPTIONS).decode(run.evaluated_mean(generation))
+    shown = run_details.run_facts(run)["reported x"].split(", ")
+    assert [float(each) for each in shown] == pytest.approx(wanted.tolist())
+
+
+def test_a_search_takes_the_mean_that_its_run_reports(confirmed_another):
+    run, generation = confirmed_another
+    objective = Objective.parse(OPTIONS)
+    given = {"minimise": True, "integer": (), "log": (), "penalty": None}
+    search = _Searches("numpy.linalg:norm", [0] * 39, 1.0, None, given, None, None, None, 0, None, {})
+    search._read_means(run, objective)
+    fitness, x = search._favorite
+    assert fitness == -3.0
+    assert np.array_equal(x, objective.decode(run.evaluated_mean(generation)))
+
+
+def test_a_share_that_is_checked_is_said_before_anything_was(runs):
+    change_journal(runs / "reality", "UPDATE run SET value = ? WHERE key = 'network'", json.dumps({"verify": 0.02}))
+    with RunFolder(runs / "reality") as run:
+        assert run.checks == CheckCounts(0.02)
 
 
 def test_the_page_has_values_and_the_kind_of_axis(minimised):
