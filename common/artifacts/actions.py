@@ -257,7 +257,7 @@ STEERING_GAS_BRAKE = Continuous(scale=(1, 0.5, 1), shift=(0, 0.5, 0), low=(-1, 0
 STEERING_AND_HALVES = Continuous.between(low=(-1, 0, 0), high=(1, 1, 1))
 # ctallec/world-models, models/controller.py: no tanh; the car limits its controls.
 STEERING_GAS_BRAKE_AS_THEY_ARE = replace(Continuous.between(low=(-1, 0, 0), high=(1, 1, 1)), squashed=False)
-# gymnasium's CarRacing-v3 with continuous=False: nothing, right, left, gas, brake.
+# gymnasium's CarRacing-v3 with continuous=False: nothing, right, left, gas, brake; docs/lab/baselines.md.
 FIVE_CHOICES = replace(
     STEERING_GAS_BRAKE, choices=((0, 0, 0), (0.6, 0, 0), (-0.6, 0, 0), (0, 0.2, 0), (0, 0, 0.8))
 )  # fmt: skip

@@ -29,8 +29,7 @@ CONNECT_TIMEOUT = 3.0  # seconds to open a link; TLS takes four or more round tr
 LEASE_MS = 4000  # after so long without a message the other side drops a session's liveliness tokens
 MAX_SESSIONS = 10_000
 MAX_RECEIVED = 128 * 1024  # bytes of a message; for a larger one Zenoh closes the link
-# Bytes of a message that a router forwards; Zenoh drops larger ones silently. More than the protocol's MAX_MESSAGE, so
-# that a slightly oversize message still reaches the coordinator and is counted there.
+# Bytes of a message that a router forwards, else Zenoh drops it: above MAX_MESSAGE, so that oversize ones are counted.
 MAX_FORWARDED = 64 * 1024
 SEND_QUEUE = 16  # batches of 64 KiB that may wait on a link, Zenoh's most; beyond them it drops messages
 # Microseconds that a message waits for room in the queue before it is dropped. A stalled link makes one message wait:

@@ -1,4 +1,4 @@
-"""What failed attempts prove: a broken host, or an episode that fails wherever it is scored. Pure."""
+"""What failed attempts prove: a broken host, or an episode that fails wherever scored. Pure. Pages: threats.md."""
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -8,7 +8,7 @@ from dreamfleet.coordinator.dispatch.failures import Attempt
 from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob, PendingJobs
 
-EQUAL_ATTEMPTS = 2  # that fail for one cause show that the episode fails; docs/reference/python.md
+EQUAL_ATTEMPTS = 2  # that fail for one cause show that the episode does; docs/reference/python.md, `--on-failure`
 ANY_ATTEMPTS = 3  # that fail for several causes show it too
 HOST_ATTEMPTS = 10  # that a host's shortage ends, over about eight minutes: no host has what the episode needs
 PAUSING_ATTEMPTS = 3  # on the only worker

@@ -23,7 +23,7 @@ from dreamfleet.common.runs.seeds import CHOOSING_OFFSET, CONFIRMING_OFFSET, val
 from dreamfleet.common.runs.standard_error import sample_std
 from dreamfleet.coordinator.jobs.scoring_job import ScoringJob, make_jobs
 
-FINALISTS = 4
+FINALISTS = 4  # whose rounds have about twice the episodes of the confirmation, as --confirm-episodes says
 FindScores = Callable[[list[ScoringJob]], Mapping[bytes, float]]
 """Finds the known scores of jobs, by digest; NaN for an episode that failed for good."""
 

@@ -8,7 +8,7 @@ from msgspec import Meta
 from dreamfleet.common.cli.bounds import check_bounds
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.protocol.messages import FleetShare, Share
-from dreamfleet.common.transport.network import parse_metrics_address
+from dreamfleet.common.transport.network import DEFAULT_ENDPOINT, parse_metrics_address
 from dreamfleet.coordinator.settings.live_log import parse_sinks
 
 
@@ -16,7 +16,7 @@ from dreamfleet.coordinator.settings.live_log import parse_sinks
 class NetworkConfig:
     """Where the coordinator is reached, and how it treats its workers."""
 
-    listen: tuple[str, ...] = option((), "listen here (default tcp/127.0.0.1:7447, unless --connect is given)")
+    listen: tuple[str, ...] = option((), f"listen here (default {DEFAULT_ENDPOINT}, unless --connect is given)")
     connect: tuple[str, ...] = option((), "connect to these stand-alone routers; with --listen, do both")
     beat: Annotated[float, Meta(ge=0.05, le=60.0)] = option(1.0, "seconds between a worker's beats")
     evaluation_share: Annotated[float, Meta(ge=0.0, le=0.9)] = option(

@@ -19,7 +19,7 @@ from dreamfleet.worker.tasks.batches import Episode
 from dreamfleet.worker.tasks.measures import Measurer
 from dreamfleet.worker.tasks.watching import StepObserver, StepSnapshot
 
-DEFAULT_TEMPERATURE = 1.0
+DEFAULT_TEMPERATURE = 1.0  # also in the help of `inspect --temperature`
 MAX_ROWS = 256  # episodes that are dreamt together: larger batches are slower (docs/explanation/decisions.md)
 TORCH_ROWS = 512  # on a torch device: half of what a worker may hold, for the next wait there: docs/lab/measurements.md
 

@@ -11,6 +11,7 @@ from dreamfleet.worker.worldmodel.config_fields import MOST, added_option, check
 
 LEAK = 0.2  # slope of the leaky activation below zero
 KERNEL, STRIDE = 4, 2
+SIDES = (64, 96)  # of a picture, the usual one first; the help of `collect`, `iterate` and `pipeline` names them
 PAPER_SIDES = (1, 5, 13, 30, 64)  # of the paper's decoder; its kernels 5, 5, 6, 6 follow
 
 
@@ -64,7 +65,7 @@ class VAEConfig:
 
     def __post_init__(self) -> None:
         check_sizes(self)
-        if self.picture not in (64, 96):
+        if self.picture not in SIDES:
             raise UsageError(f"a VAE's pictures are 64 or 96 pixels wide, not {self.picture}")
         if min(self.channels, default=0) < 1 or self.latent < 1:
             raise UsageError(f"a VAE has layers of channels and a latent, not {self.channels}, {self.latent}")

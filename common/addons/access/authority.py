@@ -38,7 +38,7 @@ from dreamfleet.common.security.credentials import SEATS, Credentials, derive_pa
 
 AUTHORITY_DAYS = 3650  # validity of the authority's certificate
 # The help of verb.py's --days has these too.
-DEFAULT_DAYS = {"coordinator": 90, "router": 90, "operator": 90, "viewer": 90, "worker": 30}  # validity of join files
+DEFAULT_DAYS = {"coordinator": 90, "router": 90, "operator": 90, "viewer": 90, "worker": 30}  # of join files; verb.py
 CLOCK_SKEW = timedelta(minutes=5)  # certificates are valid from so long before their issue
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")  # in the certificate of every listener
 _FILES = _CERTIFICATE, _KEY, _SECRET, _LIST = "ca.pem", "ca.key", "secret", LEDGER_FILE

@@ -9,7 +9,7 @@ from dreamfleet.common.cli.command_line import SimpleVerb
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, CertificateLedger, IssuedJoinFile
+from dreamfleet.common.security.certificate_ledger import CHECK_INTERVAL, LEDGER_FILE, CertificateLedger, IssuedJoinFile
 from dreamfleet.common.security.credentials import LISTENERS, ROLES, describe_time_left
 from dreamfleet.common.transport.network import SECURED_PREFIX, check_endpoint, check_secured
 
@@ -61,7 +61,7 @@ def configure_issue(parser: argparse.ArgumentParser) -> None:
 
 def issue_join_file(args: argparse.Namespace) -> int:
     """Write a join file."""
-    from dreamfleet.common.addons.access.authority import Authority
+    from dreamfleet.common.addons.access.authority import AUTHORITY_DAYS, Authority
 
     for endpoint in args.endpoints:
         if not check_secured(check_endpoint(endpoint)).startswith(SECURED_PREFIX):
@@ -70,8 +70,8 @@ def issue_join_file(args: argparse.Namespace) -> int:
         raise UsageError(f"a {args.role} connects: give --connect tls/HOST:7447, and no --host")
     if args.role in LISTENERS and not args.host and not args.endpoints:
         raise UsageError(f"a {args.role} is reached by names: give --host, or --connect where a router listens for it")
-    if args.days is not None and not 0.001 <= args.days <= 3650:
-        raise UsageError(f"--days must be from 0.001 to 3650, not {args.days:g}")
+    if args.days is not None and not 0.001 <= args.days <= AUTHORITY_DAYS:
+        raise UsageError(f"--days must be from 0.001 to {AUTHORITY_DAYS}, not {args.days:g}")
     issued = Authority(args.global_config.access_dir).issue(
         args.role, args.name, args.out, connect=args.endpoints, hosts=args.host, days=args.days
     )
@@ -125,7 +125,9 @@ def revoke_join_files(args: argparse.Namespace) -> int:
     authority = Authority(args.global_config.access_dir)
     found = authority.revoke(args.name, args.role)
     role, identity = found[0].role, found[0].identity
-    soon = "a coordinator with this --access-dir counts nothing of it from now on (2 s); " if role == "worker" else ""
+    soon = ""
+    if role == "worker":
+        soon = f"a coordinator with this --access-dir counts nothing of it from now on ({CHECK_INTERVAL:g} s); "
     text = f"{role} {args.name} ({identity}) is revoked: {soon}routers let it do nothing from their next start on"
     if gives_all := authority.uses_passwords and role in LISTENERS:
         text += ". Its file gives all passwords of the fleet: if another has it, make another authority"

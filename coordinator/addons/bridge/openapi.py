@@ -9,6 +9,7 @@ from dreamfleet.common.protocol.batches import (
     MAX_BATCH,
     MAX_CANDIDATES,
     MAX_EPISODES,
+    MAX_LISTED,
     MAX_SEEDS,
     Refusal,
 )
@@ -135,7 +136,7 @@ def document(*, needs_token: bool) -> dict[str, Any]:
             "/v1/runs": {"get": _operation("The live runs", {"200": ("the runs", "Runs")})},
             "/v1/runs/{run}/batches": {
                 "get": _operation(
-                    "The open batches in their order, then finished ones, the last first; 512 at most",
+                    f"The open batches in their order, then finished ones, the last first; {MAX_LISTED} at most",
                     {"200": ("the batches", "Batches")}, "run",
                 ),
                 "post": submit,

@@ -24,6 +24,7 @@ OPTIONS = ("-T", "-o", "BatchMode=yes", "-o", "ConnectTimeout=10", "-o", "Server
            "-o", "ServerAliveCountMax=4", "-o", "LogLevel=INFO")  # fmt: skip
 # A shared connection would keep the tunnel open after this command.
 TUNNEL = ("-o", "ControlMaster=no", "-o", "ControlPath=none", "-o", "ExitOnForwardFailure=yes")
+# From the oldest that pyproject.toml supports on, which config.py and messages below name too.
 PYTHONS = ("python3", "python3.14", "python3.13", "python3.12", "python3.11", "python")
 KEPT_LINES = 50  # of ssh's messages
 MAX_MESSAGE = 4096  # bytes kept of one of them

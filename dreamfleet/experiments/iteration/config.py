@@ -20,6 +20,7 @@ RESERVED_FLAGS = (
     "--from",
 )  # fmt: skip
 SURVIVAL_EPISODES = 40
+LATER_UPDATES = {"vae": 1800, "mdnrnn": 600}  # default of a round that continues a model's training
 LEAST = {
     "rounds": 1, "drives": 2, "more_drives": 0, "own_drives": 0, "means": 1, "drive_steps": 1, "vae_updates": 1,
     "mdnrnn_updates": 1, "gate_drives": 0, "gate_losses": 0, "seed": 0, "local": 0, "jobs": 1,
@@ -53,9 +54,12 @@ class IterateConfig:
     spells: float = option(0.0, "chance of each of their steps that an action which rests, as a brake, is tried")
     drive_steps: int | None = option(None, "steps of a drive at most (default the preset's)")
     vae: Literal["decoder", "whole", "keep"] = option("decoder", "the part of the VAE that learns on in later rounds")
-    vae_updates: int | None = option(None, "updates of the VAE in later rounds (default as --vae-flags say, else 1800)")
+    vae_updates: int | None = option(
+        None, f"updates of the VAE in later rounds (default as --vae-flags say, else {LATER_UPDATES['vae']})"
+    )
     mdnrnn_updates: int | None = option(
-        None, "updates of the MDN-RNN in each later round (default what --mdnrnn-flags say, else 600)"
+        None,
+        f"updates of the MDN-RNN in each later round (default what --mdnrnn-flags say, else {LATER_UPDATES['mdnrnn']})",
     )
     vae_flags: str = option("", 'flags of `train vae` in every round, as one text: "--updates 900 --batch 50"')
     mdnrnn_flags: str = option("", "flags of `train mdnrnn` in every round")
@@ -71,8 +75,8 @@ class IterateConfig:
     gate_losses: int = option(30, "losses of `inspect --losses` that it is held to it by; 0: none")
     gate_lives: int | None = option(
         None,
-        "episodes of each fixed policy of `inspect --survival` that it is held to it by; 0: none (default 40 with "
-        "--task, else none)",
+        "episodes of each fixed policy of `inspect --survival` that it is held to it by; 0: none (default "
+        f"{SURVIVAL_EPISODES} with --task, else none)",
     )
     seed: int = option(0, "makes the iteration: drives, training, populations and seeds of episodes follow from it")
     local: int | None = option(None, "scoring processes here (default one a core, or none where --listen is given)")

@@ -8,7 +8,7 @@ from pathlib import Path
 from dreamfleet.common.cli.world_flags import OPTIONS, world_arguments
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.runs.seeds import VALIDATION
-from dreamfleet.experiments.iteration.config import IterateConfig
+from dreamfleet.experiments.iteration.config import LATER_UPDATES, IterateConfig
 from dreamfleet.experiments.iteration.layout import IterationFolder
 from dreamfleet.experiments.iteration.ledger import IterationLedger
 from dreamfleet.experiments.iteration.plan import EVOLVE, GATE, MDNRNN, VAE, Phase
@@ -22,7 +22,6 @@ from dreamfleet.worker.training.stages.train import Model, TrainRequest
 
 GATE_SEED = VALIDATION.start + 30_000  # the first track of a gate: no evaluation and no confirmation has it
 GATE_NOISE = 0.3  # as in docs/lab/dreams-notes.md
-LATER_UPDATES = {VAE: 1800, MDNRNN: 600}  # default of a round that continues a model's training; config.py says it
 
 
 @dataclass(frozen=True)

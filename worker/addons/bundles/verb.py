@@ -51,7 +51,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--end", type=_end_rule, metavar="RULE",
         help="where dreams end: at a predicted probability from 0 to 1, or drawn, by chance (default drawn where the "
-        "reward is survival, else 0.5)",
+        f"reward is survival, else {EndRule().at})",
     )  # fmt: skip
     add_json_flag(parser)
 

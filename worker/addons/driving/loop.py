@@ -15,7 +15,7 @@ from dreamfleet.worker.dream.environment import Dream
 from dreamfleet.worker.tasks.closing import closing_environment
 from dreamfleet.worker.tasks.registry import find_task
 
-WIDTH = 640  # pixels of a dream's picture on a screen
+WIDTH = 640  # pixels of a dream's picture on a screen; the help of `--scale` says it
 
 
 class Scene(Protocol):

@@ -80,8 +80,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         f"(default {LIVES})",
     )  # fmt: skip
     figures.add_argument(
-        "--noise", type=float, default=0.3,
-        help="added to actions, in halves of their range; of choices the share of steps with another (default 0.3)",
+        "--noise", type=float, default=MeasureRequest.noise,
+        help="added to actions, in halves of their range; of choices the share of steps with another "
+        f"(default {MeasureRequest.noise})",
     )  # fmt: skip
     figures.add_argument("--temperature", type=float, help="of the dreams (default the run's, else 1.0)")
     figures.add_argument(

@@ -127,8 +127,7 @@ def film(
 ) -> Iterator[Transition]:  # fmt: skip
     """Drive an episode of at most so many steps; yield each, whose frame `on_frame` got before, if one was due.
 
-    `dreaming.seed` is the seed of both. An episode's end is held for a second. `DreamfleetError` names the seed where a
-    simulator raises anything.
+    `dreaming.seed` is the seed of both. `DreamfleetError` names the seed where a simulator raises anything.
     """
     try:
         filmed = FilmedPolicy(agent, environment, dreaming, on_frame, every)

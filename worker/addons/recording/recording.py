@@ -31,8 +31,8 @@ def record(
 ) -> tuple[float, int]:  # fmt: skip
     """Record one episode of an agent in its evaluation environment as an mp4; return its score and its steps.
 
-    With a world model, the video also shows what the model sees, decodes and, if it can, dreams. An episode's end is
-    held for a second. If `stop()` turns true, the video ends early, after at least one step.
+    With a world model, the video also shows what the model sees, decodes and, if it can, dreams. If `stop()`
+    turns true, the video ends early, after at least one step.
     """
     config = replace(dreaming or ParallelDreamConfig(), seed=seed)
     score = 0.0

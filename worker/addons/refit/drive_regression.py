@@ -22,7 +22,7 @@ from dreamfleet.worker.worldmodel.observation import join_features
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
-HELD_OUT_EVERY = 5  # every fifth drive measures R²
+HELD_OUT_EVERY = 5  # every fifth drive measures R²; stages.py asks for as many
 DRIVES_AT_ONCE = 16
 PICTURES_AT_ONCE = 100  # of the encoder
 

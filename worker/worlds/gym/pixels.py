@@ -31,12 +31,12 @@ from dreamfleet.worker.tasks.drivers import HeldActions, UniformActions
 from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.tasks.registry import preprocessing_for
 from dreamfleet.worker.worldmodel.policy import ModelPolicy
+from dreamfleet.worker.worldmodel.vae_config import SIDES
 from dreamfleet.worker.worlds.gym import environments
 from dreamfleet.worker.worlds.gym.spaces import make_converter, vector_actions
 
 RENDERED = "render"  # as an observation: what the environment draws
 EVERY_FRAME = "all"  # as an observation: all frames of the only picture, which is a stack
-SIZES = (64, 96)
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ class PixelOptions:
         default="", metadata=OPTIONAL
     )  # a Dict's key, `render` or `all`
     crop: str = field(default="", metadata=OPTIONAL)  # `top:bottom,left:right`; empty: the whole picture
-    size: int = field(default=SIZES[0], metadata=OPTIONAL)  # height and width
+    size: int = field(default=SIDES[0], metadata=OPTIONAL)  # height and width
     skip: Annotated[int, Meta(ge=1, le=1000)] = field(default=1, metadata=OPTIONAL)  # steps for which an action is held
     difference: bool = field(default=False, metadata=OPTIONAL)  # show movement, in grey
 
     def __post_init__(self) -> None:
-        if self.size not in SIZES:
-            raise UsageError(f"pictures are {' or '.join(map(str, SIZES))} pixels wide, not {self.size}")
+        if self.size not in SIDES:
+            raise UsageError(f"pictures are {' or '.join(map(str, SIDES))} pixels wide, not {self.size}")
         if self.crop and self.rows_and_columns is None:
             raise UsageError(f"a crop is top:bottom,left:right, such as 0:400,0:640, not {self.crop!r:.50}")
 

@@ -11,6 +11,7 @@ from dreamfleet.common.artifacts.task_options import check_options, read_options
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.tasks.pictures import SHORTEST, Crop, cut_and_resize, is_crop, parse_crop
 from dreamfleet.worker.tasks.recordable import Preprocessing
+from dreamfleet.worker.worldmodel.vae_config import SIDES
 from dreamfleet.worker.worlds.takecover.game import HEIGHT, LIMIT, TICS_PER_SECOND, WIDTH
 
 OPTION_HELP = {
@@ -20,7 +21,6 @@ OPTION_HELP = {
 }
 FLAGS = {"skip": "tics", "crop": "crop"}  # of any world, and what they are here
 KNOWN = ("environment", *FLAGS)
-SIZES = (64, 96)  # of the pictures that a world model sees, the usual one first
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class TakeCoverOptions:
     def preprocessings(self) -> dict[str, Preprocessing]:
         """What a world model sees, in the sizes that it may have: the crop, resized."""
         crop = "" if self.crop == TakeCoverOptions.crop else f" of {self.crop}"
-        names = {size: f"box-{size}{crop}" for size in SIZES}
+        names = {size: f"box-{size}{crop}" for size in SIDES}
         cut = partial(cut_and_resize, crop=self.part)
         return {name: Preprocessing(name, size, partial(cut, size=size)) for size, name in names.items()}
 
