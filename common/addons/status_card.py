@@ -10,7 +10,7 @@ from dreamfleet.common.client.run_view import LiveRunView
 from dreamfleet.common.client.status import Status, WorkerStatus
 from dreamfleet.common.printable import format_number, one_line, plural, truncate
 from dreamfleet.common.protocol.function_values import fitness_word
-from dreamfleet.common.runs.records import StoredGeneration, format_mean, in_values
+from dreamfleet.common.runs.records import StoredGeneration, in_values
 
 MOST_WORKERS = 12  # in the card
 LONGEST = 160  # characters of a text in the card
@@ -55,11 +55,11 @@ def status_card(status: Status) -> str:
     task, view = status.settings.task, LiveRunView.of_status(status)
     shown = [in_values(each, task) for each in status.recent]
     share = 1.0 if status.is_over else view.eta.share or 0.0
-    state = f"{status.state}: {status.why}" if status.why else status.state
-    kind = "confirmed" if status.confirmed else "best evaluation"
+    known, kind = view.facts, "confirmed" if view.confirmed else "best evaluation"
+    state = str(known["state"])
     doing = plural(status.generations, "generation") if status.is_over else view.progress
     now = [] if status.is_over else [view.speed, view.eta.description]
-    facts = [doing, *now, f"{kind} {format_mean(view.reported)}" if view.reported else ""]
+    facts = [doing, *now, f"{kind} {known[kind]}" if view.reported else ""]
     return (
         f'<div style="{CARD}"><div><b>{_text(status.run)}</b> · {_text(task.task)}'
         f'<span style="float:right">{_text(state)}</span></div>'

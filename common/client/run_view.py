@@ -266,6 +266,6 @@ class LiveRunView(RunView):
         }
 
 
-def format_episodes(part: EpisodeProgress) -> str:
-    """How many episodes of a part are done."""
-    return f"{part.episodes_done:,} of {plural(part.episodes, 'episode')}"
+def format_episodes(part: EpisodeProgress, noun: str = "episode") -> str:
+    """How many episodes of a part are done, each called `noun`."""
+    return f"{part.episodes_done:,} of {plural(part.episodes, noun)}"

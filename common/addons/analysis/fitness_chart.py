@@ -11,10 +11,10 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
+from dreamfleet.common.addons.analysis.drawn_values import log_foot, spread_of
 from dreamfleet.common.addons.analysis.learning import Point
 from dreamfleet.common.addons.analysis.scored_history import scored_history
 from dreamfleet.common.printable import plural
-from dreamfleet.common.protocol.function_values import is_minimised, spans_decades, value_of
 from dreamfleet.common.protocol.tasks import DREAM, is_function_task
 from dreamfleet.common.runs.records import StoredConfirmation, StoredEvaluation, in_values
 from dreamfleet.common.runs.run_folder import RunFolder
@@ -48,18 +48,15 @@ def draw_fitness(panels: Sequence[Any], run: RunFolder) -> list[Any]:
     """
     task, evaluations, stages = run.spec, run.evaluations(), _stages(run)
     history = [in_values(each, task) for each in scored_history(run)]
-    number, mean, std, best, worst = np.array(
-        [(each.number, each.mean, each.std, each.best, each.worst) for each in history]
-    ).T
-    in_decades = is_minimised(task) and spans_decades(
-        [*best, *worst, *(value_of(each.mean, task) for each in evaluations)]
-    )
+    in_decades = log_foot(history, [in_values(each, task) for each in evaluations], task) is not None
+    columns = np.array([(each.number, each.mean, each.best, *spread_of(each)) for each in history]).T
+    mean = columns[1]
     axes, scores = panels[0], panels[-1]
     smooth = running_median(mean, [each.since for each in stages])
     thin = {} if smooth is None else {"linewidth": 0.8, "alpha": 0.6}
     jumps = [each.since for each in stages if each.stage.restart or each.origin is not None]
     smoothed = mean if smooth is None else smooth
-    number, mean, std, best, worst, smoothed = _break_lines(jumps, number, mean, std, best, worst, smoothed)
+    number, mean, best, low, high, smoothed = _break_lines(jumps, *columns, smoothed)
     known = np.pad(~np.isnan(mean), 1)
     lone = np.flatnonzero(known[1:-1] & ~known[:-2] & ~known[2:]).tolist()  # no line leads to or from them
     dots = {"marker": "o", "markevery": lone} if lone else {}
@@ -68,8 +65,6 @@ def draw_fitness(panels: Sequence[Any], run: RunFolder) -> list[Any]:
         label = f"its running median over {WINDOW} generations"
         axes.plot(number, smoothed, color="tab:blue", linewidth=2.2, label=label)
     spread = "± 1 standard deviation (cut at worst and best)"
-    ends = np.minimum(best, worst), np.maximum(best, worst)
-    low, high = np.fmax(mean - std, ends[0]), np.fmin(mean + std, ends[1])
     axes.fill_between(number, low, high, alpha=0.2, color="tab:blue", linewidth=0, label=spread)
     axes.plot(number, best, color="tab:orange", linewidth=1, label="best candidate", **dots)
     for panel in panels:

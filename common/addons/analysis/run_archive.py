@@ -14,6 +14,7 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.client.elite_archive import Elite, EliteArchive
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import format_number
+from dreamfleet.common.protocol.measures import Axis
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 
@@ -79,16 +80,29 @@ class RunArchive(EliteArchive):
             f"{axis.measure} {format_number(value)}" for axis, value in zip(self.axes, elite.measures, strict=True)
         )
 
+    @property
+    def shown_axes(self) -> tuple[Axis, ...]:
+        """The two axes of a picture; the second one may have a single cell."""
+        return (*self.axes, Axis("", 0, 1, 1))[:2]
+
+    @property
+    def shown(self) -> dict[tuple[int, ...], Elite]:
+        """The elite that each cell of a picture shows: the best one over the other axes, of equals the first."""
+        found: dict[tuple[int, ...], Elite] = {}
+        for elite in self.elites.values():
+            best = found.setdefault((*elite.cell, 0)[:2], elite)
+            if elite.fitness > best.fitness:
+                found[(*elite.cell, 0)[:2]] = elite
+        return found
+
     def grid(self) -> NDArray[np.float64]:
         """The fitness by cell of the first axis, and of the second if there is one: `(cells, cells)`; NaN if empty.
 
         Over further axes it is that of the best elite.
         """
-        first, second = (*(axis.cells for axis in self.axes), 1)[:2]
-        fitness = np.full((first, second), np.nan)
-        for elite in self.elites.values():
-            place = (*elite.cell, 0)[:2]
-            fitness[place] = np.fmax(fitness[place], elite.fitness)
+        fitness = np.full([axis.cells for axis in self.shown_axes], np.nan)
+        for place, elite in self.shown.items():
+            fitness[place] = elite.fitness
         return fitness
 
     def find(self, text: str) -> Elite:

@@ -8,13 +8,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from dreamfleet.common.addons.analysis.drawn_values import describe_all_steps, effort_axes, goal_of, log_foot, spread_of
 from dreamfleet.common.addons.analysis.run_archive import exploration_note
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.function_values import (
     fitness_word,
     is_minimised,
-    least_positive,
-    spans_decades,
     value_of,
 )
 from dreamfleet.common.protocol.messages import TaskSpec
@@ -27,7 +26,7 @@ from dreamfleet.common.runs.records import (
     StoredGeneration,
     in_values,
 )
-from dreamfleet.common.runs.stages import begun_stages, describe_steps, join_distinct
+from dreamfleet.common.runs.stages import begun_stages
 
 MOST_POINTS = 600  # sent and drawn at most: a screen shows no more
 T = TypeVar("T")
@@ -70,27 +69,21 @@ def curves(
     dreamt, every = settings.task.task == DREAM, settings.evaluate_every
     often = "of each generation" if every == 1 else f"every {every} generations"
     stages = begun_stages(settings, data.history, data.evaluations)
-    steps = join_distinct(
-        describe_steps(
-            each.stage.settings.task.horizon, each.stage.settings.driven, dreamt=dreamt, limit=data.episode_limit
-        )
-        for each in stages
-    )
+    steps = describe_all_steps(stages, task, data.episode_limit)
     band, looks = _band(rows, quartiles, task), downsample(data.evaluations)
     reported = [] if data.confirmed is None else [data.confirmed]
     confirmed = _judged(reported, [len(data.history) - 1] * len(reported), task, spent)
-    ends = [end for each in rows for end in (each.best, each.mean)]
-    is_log = is_minimised(task) and bool(rows) and spans_decades(ends)
-    foot = least_positive(ends) if is_log else -math.inf  # where a logarithmic axis has its zeros
+    begin = log_foot(rows, [in_values(each, task) for each in looks], task)
+    is_log, foot = begin is not None, -math.inf if begin is None else begin
     drawn: dict[str, Any] = {
         "step": sampling_step(len(data.history)),
         "generation": [each.number for each in rows],
-        "mean": [_rounded(max(each.mean, foot)) for each in rows],
-        "best": [_rounded(max(each.best, foot)) for each in rows],
-        "low": [_rounded(max(low, foot)) for low, _ in band],
-        "high": [_rounded(high) for _, high in band],
+        "mean": [rounded(max(each.mean, foot)) for each in rows],
+        "best": [rounded(max(each.best, foot)) for each in rows],
+        "low": [rounded(max(low, foot)) for low, _ in band],
+        "high": [rounded(high) for _, high in band],
         "band": "± 1 standard deviation" if quartiles is None else "the middle half of the candidates",
-        "sigma": [_rounded(each.sigma) for each in rows],
+        "sigma": [rounded(each.sigma) for each in rows],
         "evaluations": _judged(looks, [each.generation for each in looks], task, spent),
         "confirmed": {name: column[0] for name, column in confirmed.items()} if reported else None,
         "stages": [each.since for each in stages[1:]],
@@ -107,20 +100,18 @@ def curves(
     }
     if spent is not None:
         drawn |= _effort_columns([spent[each.number] for each in rows if each.number < len(spent)])
+        drawn["spent_axes"] = effort_axes(calls=is_function_task(task.task))
     return drawn
 
 
 def _value_axis(task: TaskSpec, *, is_log: bool) -> str:
-    goal = "smaller is better" if is_minimised(task) else "larger is better"
-    return f"value: {goal}{' (log scale)' if is_log else ''}"
+    return f"value: {goal_of(minimised=is_minimised(task))}{' (log scale)' if is_log else ''}"
 
 
 def _band(rows: Sequence[StoredGeneration], quartiles: Quartiles | None, task: TaskSpec) -> list[tuple[float, float]]:
     """The band's ends of rows in values; quartiles are of fitness."""
     if quartiles is None:
-        ends = [sorted((each.best, each.worst)) for each in rows]
-        return [(max(each.mean - each.std, low), min(each.mean + each.std, high))
-                for each, (low, high) in zip(rows, ends, strict=True)]  # fmt: skip
+        return [spread_of(each) for each in rows]
     fitness = [quartiles.get(each.number) for each in rows]
     return [(each.mean, each.mean) if pair is None else tuple(sorted(value_of(end, task) for end in pair))  # type: ignore[misc]
             for each, pair in zip(rows, fitness, strict=True)]  # fmt: skip
@@ -133,8 +124,8 @@ def _judged(
     """Columns of means that were judged, with the effort until the end of these generations."""
     columns: dict[str, list[Any]] = {
         "generation": [each.generation for each in rows],
-        "mean": [_rounded(value_of(each.mean, task)) for each in rows],
-        "error": [_rounded(each.error) for each in rows],
+        "mean": [rounded(value_of(each.mean, task)) for each in rows],
+        "error": [rounded(each.error) for each in rows],
         "episodes": [each.episodes for each in rows],
     }
     if spent is None:
@@ -150,7 +141,7 @@ def _effort_columns(efforts: Sequence[Effort]) -> dict[str, list[float]]:
     }
 
 
-def _rounded(value: float | None) -> float | None:
-    """The number with 5 digits; `None` for NaN and infinity, and for no number."""
+def rounded(value: float | None) -> float | None:
+    """The number with the 5 digits that a page shows at most; `None` for NaN and infinity, and for no number."""
     short = math.nan if value is None else float(f"{value:z.5g}")
     return short if math.isfinite(short) else None

@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from dreamfleet.common.client.eta import Eta
-from dreamfleet.common.client.run_view import LiveRunView
+from dreamfleet.common.client.run_view import LiveRunView, format_episodes
 from dreamfleet.common.client.status import ArchiveStatus, Population, Status, WorkerStatus
-from dreamfleet.common.printable import format_duration, format_number, plural, printable
+from dreamfleet.common.printable import format_duration, format_number, printable
 from dreamfleet.common.protocol.function_values import fitness_word, is_minimised, value_of
 from dreamfleet.common.runs.effort import format_steps
 from dreamfleet.common.runs.records import format_mean
 from dreamfleet.common.runs.run_paths import resume_command
+from dreamfleet.coordinator.addons.dashboard.curves import rounded
 
 LIVE, LOST, OVER = "live", "lost", "over"
 NONE = "-"
@@ -122,11 +123,7 @@ def _candidates(parts: Sequence[Population], status: Status) -> dict[str, Any]:
         "total": max((each.total for each in parts), default=0),
         "done": [done for each in parts for done in each.done],
         "wanted": [wanted for each in parts for wanted in each.wanted],
-        "fitness": [
-            None if value is None else float(f"{value_of(value, task):z.5g}")
-            for each in parts
-            for value in each.fitness
-        ],
+        "fitness": [rounded(value and value_of(value, task)) for each in parts for value in each.fitness],
         "word": fitness_word(task),
         "minimised": is_minimised(task),
     }
@@ -139,7 +136,7 @@ def _progress(status: Status, word: str) -> list[str]:
         "kept rollouts": (status.collecting, "episode"),
     }  # fmt: skip
     return [
-        f"{name}: {each.episodes_done:,} of {plural(each.episodes, noun)}"
+        f"{name}: {format_episodes(each, noun)}"
         for name, (each, noun) in parts.items()
         if each.episodes > each.episodes_done
     ]

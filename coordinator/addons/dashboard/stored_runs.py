@@ -8,16 +8,14 @@ from math import isnan
 from pathlib import Path
 from typing import Any
 
-from dreamfleet.common.addons.analysis.learning import efforts_until
+from dreamfleet.common.addons.analysis.learning import efforts_until, world_of
 from dreamfleet.common.addons.analysis.run_archive import RunArchive
 from dreamfleet.common.addons.analysis.scored_history import scored_history
-from dreamfleet.common.artifacts.bundle import Bundle
-from dreamfleet.common.client.elite_archive import Elite
 from dreamfleet.common.client.run_view import RunView
 from dreamfleet.common.errors import DreamfleetError, JournalError
 from dreamfleet.common.printable import format_duration, printable
-from dreamfleet.common.protocol.measures import Axis, describe_measure
-from dreamfleet.common.protocol.tasks import DREAM, is_function_task
+from dreamfleet.common.protocol.measures import describe_measure
+from dreamfleet.common.protocol.tasks import is_function_task
 from dreamfleet.common.runs.effort import Effort, format_steps
 from dreamfleet.common.runs.records import (
     RunSettings,
@@ -85,7 +83,7 @@ def describe_archive(archive: RunArchive | None) -> dict[str, Any] | None:
     """What the heat map of an archive needs: middles of cells, fitness by row, titles; `None` without an archive."""
     if archive is None:
         return None
-    first, second = (*archive.axes, Axis("", 0, 1, 1))[:2]
+    first, second = archive.shown_axes
     more = ". Each cell shows its best over the other axes" if len(archive.axes) > 2 else ""
     return {
         "x": first.middles, "y": second.middles,
@@ -98,12 +96,7 @@ def describe_archive(archive: RunArchive | None) -> dict[str, Any] | None:
 
 def _cell_texts(archive: RunArchive) -> list[list[str]]:
     """What `--cell` takes for the elite that each cell of the picture shows, by row; empty without one."""
-    best: dict[tuple[int, ...], Elite] = {}
-    for elite in archive.elites.values():
-        place = (*elite.cell, 0)[:2]
-        if place not in best or elite.fitness > best[place].fitness:
-            best[place] = elite
-    columns, rows = (*(axis.cells for axis in archive.axes), 1)[:2]
+    best, (columns, rows) = archive.shown, (axis.cells for axis in archive.shown_axes)
     return [
         [",".join(map(str, best[column, row].cell)) if (column, row) in best else "" for column in range(columns)]
         for row in range(rows)
@@ -128,12 +121,10 @@ def _run_row(path: Path) -> dict[str, Any]:
 
 
 def _world(run: RunFolder) -> str:
-    """The task that gives the scores; for a dream, the task of its world model."""
-    task = run.spec.task
-    if task == DREAM:
-        with suppress(DreamfleetError, OSError):  # its world model may be gone
-            task = Bundle.open(run.bundle_path, run.spec.bundle).manifest.task
-    return printable(task)
+    """The task that gives the scores, of a dream whose world model is gone the dream's."""
+    with suppress(DreamfleetError, OSError):
+        return printable(world_of(run))
+    return printable(run.spec.task)
 
 
 def _tiles(run: RunFolder, view: RunView, total: Effort) -> list[dict[str, str]]:

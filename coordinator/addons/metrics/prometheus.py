@@ -10,7 +10,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.exposition import generate_latest
 from prometheus_client.registry import Collector
 
-from dreamfleet.common.client.eta import estimate_eta
+from dreamfleet.common.client.run_view import LiveRunView
 from dreamfleet.common.client.status import FINAL_STATES, Status, WorkerStatus
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol.check_counts import CheckCounts
@@ -58,7 +58,7 @@ def collect_metrics(status: Status) -> Iterator[Metric]:
 
 
 def _progress(status: Status) -> Iterator[Metric]:
-    opened, spent = status.generation, status.throughput
+    opened, spent, view = status.generation, status.throughput, LiveRunView.of_status(status)
     states = {each: each == status.state for each in STATES}
     yield _metric("state", "1 for the state that the run is in.", states, "state")
     yield _metric("generation", "The open generation's number.", opened.number)
@@ -66,13 +66,11 @@ def _progress(status: Status) -> Iterator[Metric]:
     yield _metric("generation_episodes_done", "Its episodes that are scored.", opened.episodes_done)
     yield _metric("generation_episodes", "Its episodes known so far.", opened.episodes)
     yield _metric("generations_closed_total", "Generations that were closed.", status.generations)
-    failed = status.failed + opened.failed
-    yield _metric("failed_candidates_total", "Candidates of which an episode failed everywhere.", failed)
+    yield _metric("failed_candidates_total", "Candidates of which an episode failed everywhere.", view.failed)
     yield _metric("environment_steps_total", "Environment steps of candidates.", spent.environment_steps)
     yield _metric("steps_per_second", "Environment steps a second of the present workers.", spent.steps_per_second)
-    eta = estimate_eta(status)
-    yield _metric("pace_seconds", "Seconds a generation, the median of the last ones.", eta.pace)
-    yield _metric("eta_seconds", "Seconds until the run ends, confirmation included.", eta.seconds)
+    yield _metric("pace_seconds", "Seconds a generation, the median of the last ones.", view.eta.pace)
+    yield _metric("eta_seconds", "Seconds until the run ends, confirmation included.", view.eta.seconds)
     yield _metric("uptime_seconds", "Seconds since its coordinator started.", status.uptime)
 
 

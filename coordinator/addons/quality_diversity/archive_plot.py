@@ -26,7 +26,7 @@ def archive_figure(run: RunFolder) -> ShownFigure:
     if archive is None or not archive.elites:
         what = "has no archive: begin one with --archive" if archive is None else "has no elite yet: wait for the first"
         raise UsageError(f"run {run.name} {what}")
-    first, second = (*archive.axes, Axis("", 0, 1, 1))[:2]
+    first, second = archive.shown_axes
     figure = ShownFigure(figsize=(8, 6), layout="constrained")
     axes = figure.subplots()
     axes.set_facecolor(EMPTY)

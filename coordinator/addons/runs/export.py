@@ -15,7 +15,7 @@ from dreamfleet.common.addons.analysis.scored_history import scored_history
 from dreamfleet.common.errors import MissingExtraError, UsageError
 from dreamfleet.common.files.atomic_write import open_output, reporting_write_errors
 from dreamfleet.common.files.regular_files import is_file, is_folder
-from dreamfleet.common.files.tensorboard import EVENTS, EXTRA, open_event_file
+from dreamfleet.common.files.tensorboard import EVENTS, EXTRA, EventFileWriter, open_event_file
 from dreamfleet.common.runs.records import (
     StoredCandidate,
     StoredConfirmation,
@@ -77,7 +77,7 @@ def export_tensorboard(run: RunFolder, folder: Path) -> list[Path]:
         raise UsageError(f"{folder} holds TensorBoard's events already: choose another --out")
     try:
         with open_event_file(folder) as events:
-            events.add_text("settings", f"```\n{run.settings.to_json()}\n```")
+            add_settings(events, run)
             for step, numbers in scalars_of(run):
                 events.add(step, **numbers)
     except BaseException:  # an incomplete file would block the next attempt
@@ -85,6 +85,11 @@ def export_tensorboard(run: RunFolder, folder: Path) -> list[Path]:
             each.unlink(missing_ok=True)
         raise
     return sorted(folder.glob(EVENTS))
+
+
+def add_settings(events: EventFileWriter, run: RunFolder) -> None:
+    """Write a run's settings as a text."""
+    events.add_text("settings", f"```\n{run.settings.to_json()}\n```")
 
 
 def scalars_of(run: RunFolder, since: int = 0) -> Iterator[tuple[int, dict[str, float]]]:

@@ -15,6 +15,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.legend import Legend
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
+from dreamfleet.common.addons.analysis.drawn_values import describe_all_steps, effort_axes, goal_of
 from dreamfleet.common.addons.analysis.fitness_chart import (
     PLAIN,
     PLOT_COLOURS,
@@ -31,11 +32,11 @@ from dreamfleet.common.files.atomic_write import open_output
 from dreamfleet.common.host.add_ons import add_on
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.function_values import is_minimised, spans_decades
-from dreamfleet.common.protocol.tasks import DREAM, is_function_task
+from dreamfleet.common.protocol.tasks import is_function_task
 from dreamfleet.common.runs.effort import Effort, format_steps
 from dreamfleet.common.runs.records import SUBMITTED
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.common.runs.stages import begun_stages, describe_steps, join_distinct
+from dreamfleet.common.runs.stages import begun_stages, join_distinct
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.profile import PublishedScores
 from dreamfleet.common.worlds.score_words import score_word
@@ -75,12 +76,7 @@ def fitness_figure(run: RunFolder) -> Figure:
     shares = [3, 2] if two else [1]
     panels = figure.subplots(len(shares), 1, sharex=True, squeeze=False, height_ratios=shares)[:, 0]
     handles = draw_fitness(list(panels), run)
-    dreamt = settings.task.task == DREAM
-    limit_of_run = run.episode_limit
-    steps = join_distinct(
-        describe_steps(each.stage.settings.task.horizon, each.stage.settings.driven, dreamt=dreamt, limit=limit_of_run)
-        for each in stages
-    )
+    steps = describe_all_steps(stages, settings.task, run.episode_limit)
     evaluated = "; evaluated: whole episodes" if run.evaluations() and not two else ""
     limit = textwrap.wrap(f"in {steps} at most{evaluated}", LABEL)
     is_function = is_function_task(settings.task.task)
@@ -105,7 +101,7 @@ def _note(run: RunFolder) -> str:
 
 
 def _value_axis(run: RunFolder, axes: Any) -> str:
-    goal = "smaller is better" if is_minimised(run.spec) else "larger is better"
+    goal = goal_of(minimised=is_minimised(run.spec))
     return f"value of the function ({goal}{', log scale' if axes.get_yscale() == 'log' else ''})"
 
 
@@ -148,10 +144,8 @@ def learning_figure(curves: Sequence[LearningCurve], marks: PublishedScores | No
     if is_log:
         over_steps.set_yscale("log")  # of both panels: they share the axis
     over_steps.set_ylabel(_score_axis(curves, "log scale" if is_log else ""))
-    for axes, spent_in in (
-        (over_steps, _steps_axis(curves)),
-        (over_hours, "core-hours: time that slots worked on accepted results"),
-    ):
+    names = effort_axes(calls=all(is_function_task(each.world) for each in curves))
+    for axes, spent_in in zip((over_steps, over_hours), names.values(), strict=True):
         axes.set_xlabel(f"{spent_in}{' (log scale)' if _scale(axes) else ''}")
         axes.margins(y=0.1)
         axes.grid(alpha=0.3, which="major")
@@ -249,17 +243,11 @@ def show_as_is(legend: Legend) -> None:
 
 def _score_axis(curves: Sequence[LearningCurve], scale: str) -> str:
     if all(is_function_task(each.world) for each in curves):
-        goals = {"smaller is better" if each.minimised else "larger is better" for each in curves}
+        goals = {goal_of(minimised=each.minimised) for each in curves}
         about = ", ".join(filter(None, (*(goals if len(goals) == 1 else ()), scale)))
         return f"value of the function at the mean{f' ({about})' if about else ''}"
     word = score_word(curves[0].world) if len({each.world for each in curves}) == 1 else "seed"
     return f"score of the mean (± standard error)\nin whole episodes on validation {word}s"
-
-
-def _steps_axis(curves: Sequence[LearningCurve]) -> str:
-    if all(is_function_task(each.world) for each in curves):
-        return "calls of the function, those of evaluated means included"
-    return "environment steps in reality, evaluations included"
 
 
 def save_figure(figure: Any, path: Path) -> None:

@@ -5,12 +5,13 @@ Pages: quality-diversity.md, own-objective.md, trust.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.addons.analysis.run_archive import RunArchive
+from dreamfleet.common.addons.analysis.scored_history import scored_history
 from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.client.equal_fitness import EqualFitness
 from dreamfleet.common.client.run_view import RunView
@@ -20,6 +21,7 @@ from dreamfleet.common.protocol.function_values import value_of
 from dreamfleet.common.protocol.tasks import DREAM, is_function_task
 from dreamfleet.common.runs.records import (
     RunSettings,
+    StoredGeneration,
     best_evaluation,
     count_failed,
     describe_failed,
@@ -29,6 +31,7 @@ from dreamfleet.common.runs.records import (
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import begun_stages, describe_stages
 from dreamfleet.common.worlds.score_words import score_word_of_run
+from dreamfleet.coordinator.addons.runs.export import rows_of
 from dreamfleet.coordinator.settings.config import DEFAULT_HORIZON, RunConfig
 
 if TYPE_CHECKING:
@@ -74,20 +77,19 @@ def run_row(path: Path, *, as_values: bool) -> dict[str, Any]:
 
 def run_document(run: RunFolder) -> dict[str, Any]:
     """All of a run for programs: facts, settings, generations and evaluations."""
-    settings, history, evaluations, confirmed = run.settings, run.history(), run.evaluations(), run.confirmation()
-    unscored, checks, archive = run.unscored_generations(), run.checks, RunArchive.of(run)
-    begun = begun_stages(settings, history, evaluations) if settings.stages else ()
-    missing = dict.fromkeys(FITNESS)
+    settings, history, confirmed = run.settings, run.history(), run.confirmation()
+    checks, archive = run.checks, RunArchive.of(run)
+    begun = begun_stages(settings, history, run.evaluations()) if settings.stages else ()
     return {
         **_identity(run),
         "lasted_seconds": run.duration_seconds,
         "failed_candidates": count_failed(history),
         "replaced_seeds": run.count_reseeds(history),
-        "equal_generations": EqualFitness(() if settings.is_external else history).count,
+        "equal_generations": _equal_fitness(settings, history).count,
         "settings": asdict(settings),
         "confirmed": None if confirmed is None else with_error(confirmed),
-        "history": [asdict(each) | (missing if each.number in unscored else {}) for each in history],
-        "evaluations": [with_error(each) for each in evaluations],
+        "history": rows_of(run, "generations"),
+        "evaluations": rows_of(run, "evaluations"),
         "stages": [{"number": each.stage.number, "since": each.since, "after": each.why} for each in begun],
         "classes": asdict(run.classes),
         **({} if checks is None else {"checks": asdict(checks)}),
@@ -102,7 +104,7 @@ def run_facts(run: RunFolder) -> dict[str, Any]:
     if run.duration_seconds is not None:
         facts["ended_at"] = f"{run.ended_at}, {format_duration(run.duration_seconds)} after it began"
     facts["failed_candidates"] = describe_failed(settings, history, run.count_reseeds(history))
-    if warning := EqualFitness(() if settings.is_external else history).describe(settings.task):
+    if warning := _equal_fitness(settings, history).describe(settings.task):
         facts["warning"] = warning
     facts |= {"hosts": classes.description, **{f"class {name}": hosts for name, hosts in classes.rows}}
     if run.checks is not None:
@@ -120,6 +122,10 @@ def run_facts(run: RunFolder) -> dict[str, Any]:
         begun = begun_stages(settings, history, run.evaluations())
         facts |= {"stage": f"{begun[-1].stage.number} of {len(settings.stages)}", **describe_stages(settings, begun)}
     return facts
+
+
+def _equal_fitness(settings: RunSettings, history: Sequence[StoredGeneration]) -> EqualFitness:
+    return EqualFitness(() if settings.is_external else history)  # as `take_snapshot` says of a live one
 
 
 def _identity(run: RunFolder) -> dict[str, Any]:
@@ -189,15 +195,14 @@ def unused_settings(settings: RunSettings) -> set[str]:
 
 def generation_rows(run: RunFolder) -> list[dict[str, object]]:
     """A row for each closed generation, with the evaluation of its mean."""
-    unscored = run.unscored_generations()
     judged = {each.generation: value_of(each.mean, run.spec) for each in run.evaluations()}
     rows: list[dict[str, object]] = []
-    for each in (in_values(closed, run.spec) for closed in run.history()):
+    for each in (in_values(closed, run.spec) for closed in scored_history(run)):
         fitness = {"average" if name == "mean" else name: getattr(each, name) for name in FITNESS}
         evaluated = judged.get(each.number)
         rows.append({
             "generation": each.number,
-            **{name: format_number(None if each.number in unscored else value) for name, value in fitness.items()},
+            **{name: format_number(value) for name, value in fitness.items()},
             "sigma": format_number(each.sigma), "failed": each.failed or "", "steps": f"{each.steps:,}",
             "seconds": f"{each.seconds:.1f}", "evaluated": "" if evaluated is None else format_number(evaluated),
         })  # fmt: skip

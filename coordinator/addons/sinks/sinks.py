@@ -15,6 +15,7 @@ from dreamfleet.common.files.tensorboard import EVENTS, EXTRA, open_event_file
 from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.trusted_modules import find_attribute, import_trusted
 from dreamfleet.common.runs.run_folder import RunFolder
+from dreamfleet.coordinator.addons.runs.export import add_settings
 from dreamfleet.coordinator.settings.live_log import SinkName, parse_sink
 
 OWNER = "run_uid"  # a file beside TensorBoard's, with the identity of the run that writes there
@@ -82,7 +83,7 @@ class TensorBoardSink:
         self._events = self._stack.enter_context(open_event_file(self._folder))
         owner.write_text(run.uid)
         if not self.known:
-            self._events.add_text("settings", f"```\n{run.settings.to_json()}\n```")
+            add_settings(self._events, run)
 
     def log(self, step: int, numbers: Mapping[str, float]) -> None:
         """Write one record."""

@@ -5,13 +5,11 @@ Pages: security.md.
 
 import math
 import shlex
-import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import pairwise, zip_longest
 
-from rich.cells import cell_len, chop_cells
 from rich.console import Console, ConsoleOptions, Group, RenderResult
 from rich.panel import Panel
 from rich.text import Text
@@ -35,7 +33,7 @@ from dreamfleet.coordinator.addons.status.terminal_charts import (
     candidate_grid_height,
     share_bar,
 )
-from dreamfleet.coordinator.addons.status.worker_table import WorkerTable
+from dreamfleet.coordinator.addons.status.worker_table import WorkerTable, wrap
 
 # `coordinator/run/shown_state.py` names the states, and the page colours them in `dashboard/page/live.js`.
 STATE_STYLES = {
@@ -149,19 +147,14 @@ def _troubles(status: Status) -> Iterator[tuple[str, str]]:
 def _progress_lines(view: LiveRunView, width: int) -> list[Text]:
     share = view.eta.share
     bar = "" if share is None else f"{share_bar(share, min(BAR_WIDTH, width // 3))} {share:4.0%}  "
-    lines = _wrap(printable(view.eta.description), max(width - len(bar), 1))
+    lines = wrap(printable(view.eta.description), max(width - len(bar), 1))
     return [Text.assemble((bar, "cyan"), line) if row == 0 else Text(" " * len(bar) + line)
             for row, line in enumerate(lines)]  # fmt: skip
 
 
 def _text_block(priority: int, text: str, width: int, style: str, min_lines: int = 1) -> Block:
-    lines = [Text(each, style=style) for each in _wrap(printable(text), width)]
+    lines = [Text(each, style=style) for each in wrap(printable(text), width)]
     return Block(priority, min(min_lines, len(lines)), len(lines), len(lines), lambda given: lines[:given])
-
-
-def _wrap(text: str, width: int) -> list[str]:
-    """Wrap between words; text with wide characters anywhere."""
-    return textwrap.wrap(text, width) if cell_len(text) == len(text) else chop_cells(text, width)
 
 
 def _facts(view: LiveRunView) -> Iterator[tuple[int, str, str]]:
@@ -233,7 +226,7 @@ def _fact_lines(facts: Sequence[tuple[int, str, str]], width: int) -> list[Text]
 
 def _fact(each: tuple[int, str, str], width: int) -> list[Text]:
     _, name, value = each
-    lines = _wrap(printable(value), max(width - LABEL_WIDTH, 1)) or [""]
+    lines = wrap(printable(value), max(width - LABEL_WIDTH, 1)) or [""]
     return [
         Text.assemble(((name if row == 0 else "").ljust(LABEL_WIDTH), "dim"), line) for row, line in enumerate(lines)
     ]
@@ -326,5 +319,5 @@ def _workers_block(status: Status, width: int, worker_flags: str) -> Block:
         f"{none}; start one with",
         f"dreamfleet worker --run {status.run} {worker_flags}{task_flag}",
     ]
-    lines = [Text(part, style="yellow") for each in messages for part in _wrap(printable(each), width)]
+    lines = [Text(part, style="yellow") for each in messages for part in wrap(printable(each), width)]
     return Block(6, min(3, len(lines)), len(lines), len(lines), lambda given: lines[:given])

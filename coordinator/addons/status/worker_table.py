@@ -83,8 +83,12 @@ def _row_height(each: WorkerStatus, width: int) -> int:
 def _reason_lines(each: WorkerStatus, width: int) -> list[str]:
     """Why a worker left, beneath its row."""
     room, text = max(width - COLUMN_GAP, 1), printable(each.reason)
-    lines = textwrap.wrap(text, room) if cell_len(text) == len(text) else chop_cells(text, room)
-    return [f"{' ' * COLUMN_GAP}{line}" for line in lines]
+    return [f"{' ' * COLUMN_GAP}{line}" for line in wrap(text, room)]
+
+
+def wrap(text: str, width: int) -> list[str]:
+    """Wrap between words; text with wide characters anywhere."""
+    return textwrap.wrap(text, width) if cell_len(text) == len(text) else chop_cells(text, width)
 
 
 def _build_table(

@@ -9,7 +9,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from dreamfleet.common.protocol.function_values import fitness_word, is_minimised
+from dreamfleet.common.addons.analysis.drawn_values import goal_of
+from dreamfleet.common.protocol.function_values import fitness_word, is_minimised, value_of
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
@@ -49,9 +50,9 @@ class RunResult:
             return self
 
         def own(curve: tuple[CurvePoint, ...]) -> tuple[CurvePoint, ...]:
-            return tuple(replace(each, score=0.0 - each.score) for each in curve)
+            return tuple(replace(each, score=value_of(each.score, task)) for each in curve)
 
-        scores = {kind: 0.0 - score for kind, score in self.scores.items()}
+        scores = {kind: value_of(score, task) for kind, score in self.scores.items()}
         return replace(self, scores=scores, evaluated=own(self.evaluated), fitness=own(self.fitness))
 
 
@@ -113,7 +114,7 @@ def word_of(results: Sequence[RunResult]) -> str:
 
 def with_goal(text: str, results: Sequence[RunResult]) -> str:
     """A score's name, with its goal if that is to be small."""
-    goals = {"smaller is better" if is_minimised(each.task) else "" for each in results if each.task is not None}
+    goals = {goal_of(minimised=True) if is_minimised(each.task) else "" for each in results if each.task is not None}
     goal = goals.pop() if len(goals) == 1 else ""
     return f"{text} ({goal})" if goal else text
 

@@ -228,11 +228,6 @@ export const search = (element, curves) =>
     return { traces, shape, keys: [] };
   });
 
-const OVER = {
-  generation: "generation",
-  steps: "environment steps in reality, evaluations included",
-  core_hours: "core-hours that slots worked on accepted results",
-};
 const PAIR = ["blue", "orange"];
 
 // Two runs on one chart.
@@ -260,7 +255,7 @@ export const both = (element, runs, over, of) =>
       traces,
       keys,
       shape: {
-        xaxis: over === "generation" ? generations(last) : below(OVER[over], { rangemode: "tozero" }),
+        xaxis: over === "generation" ? generations(last) : below([...new Set(runs.map(({ curves }) => curves.spent_axes[over]))].join(", or "), { rangemode: "tozero" }),
         yaxis: axis(runs.every(({ curves }) => curves.log) ? logarithmic : {}),
         annotations: [heading(label)],
         hovermode: "closest",

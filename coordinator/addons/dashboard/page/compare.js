@@ -55,7 +55,7 @@ const fillChart = (page, runs) => {
     page.chart.setAttribute("aria-label", `${of} of ${runs.map((each) => each.run).join(" and ")} over ${over}`);
     say(page.caption, note(runs, of) || (of === "evaluations" ? "Bars: ± one standard error." : ""));
   };
-  radios(page.over, "over", [["generation", "generations"], ["steps", "environment steps"], ["core_hours", "core-hours"]], over, (value) => {
+  radios(page.over, "over", [["generation", "generations"], ["steps", runs.every(({ curves }) => curves.score_word === "value") ? "calls" : "environment steps"], ["core_hours", "core-hours"]], over, (value) => {
     over = value;
     draw();
   });

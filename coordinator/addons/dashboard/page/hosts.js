@@ -63,7 +63,7 @@ const fillPage = (page, found) => {
     each.append(make("time"), make("span"));
     return each;
   }, (each, { at, text }) => {
-    say(each.firstChild, clock(at, width * 120));
+    say(each.firstChild, clock(at, width * hosts[0].rate.length));
     say(each.lastChild, text);
   });
 };

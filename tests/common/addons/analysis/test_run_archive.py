@@ -50,6 +50,15 @@ def test_facts_and_tables():
     assert grid[5, 2] == 3
 
 
+def test_a_picture_shows_the_best_elite_over_further_axes_and_a_single_axis_as_a_row():
+    axes = parse_axes(("speed=0:100:2", "braking=0:1:2", "steering=0:1:2"))
+    elites = {cell: Elite(cell, 1, 2, fitness, (0, 0, 0)) for cell, fitness in {(1, 0, 0): 3.0, (1, 0, 1): 4.0}.items()}
+    many = RunArchive(axes, elites)
+    assert (list(many.shown), many.shown[1, 0].cell, many.grid()[1, 0]) == ([(1, 0)], (1, 0, 1), 4.0)
+    one = RunArchive(axes[:1], {(1,): Elite((1,), 1, 2, 3.0, (60.0,))})
+    assert ([axis.cells for axis in one.shown_axes], one.grid()[1, 0]) == ([2, 1], 3.0)
+
+
 def test_elites_are_added_one_generation_after_another_as_all_at_once():
     earlier, later = [(0, 0, 1.0, (5, 0)), (0, 1, 2.0, (7, 0.1))], [(1, 0, 2.0, (3, 0)), (1, 1, 9.0, (95, 1))]
     archive = RunArchive(AXES, {})

@@ -3,7 +3,8 @@ A function that is minimised has its own values. What runs learnt from what they
 fitness as pictures; what differs between them.
 
 Tests plot.py, run_details.py, verb.py, analysis_verb.py, common/protocol/function_values.py, common/runs/effort.py,
-common/addons/analysis/comparison.py, common/addons/analysis/fitness_chart.py, common/addons/analysis/learning.py,
+common/addons/analysis/comparison.py, common/addons/analysis/drawn_values.py,
+common/addons/analysis/fitness_chart.py, common/addons/analysis/learning.py,
 coordinator/addons/dashboard/compared_runs.py, dreamfleet/experiments/verbs/compare.py and
 coordinator/addons/runs/citation.py.
 """
@@ -28,6 +29,7 @@ from dreamfleet.common.addons.analysis.comparison import (
     differing_settings,
     differing_values,
 )
+from dreamfleet.common.addons.analysis.drawn_values import effort_axes
 from dreamfleet.common.addons.analysis.fitness_chart import WINDOW, running_median
 from dreamfleet.common.addons.analysis.learning import LearningCurve, Point
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
@@ -290,6 +292,19 @@ def test_the_plots_fall_on_a_logarithmic_axis_that_says_so(minimised):
     assert axes.get_yscale() == "log"
     mean = axes.lines[0].get_ydata()
     assert (mean[0], mean[-1]) == pytest.approx((1000, 1))
+
+
+@pytest.mark.parametrize(("worst", "judged", "is_log"), [(1e6, 2.0, False), (3.0, 2e3, True), (3.0, 2.0, False)])
+def test_the_page_and_the_picture_choose_the_same_kind_of_axis(minimised, worst, judged, is_log):
+    path = minimised / "reality"
+    change_journal(path, "UPDATE generation SET mean = -2, std = 0.1, best = -1, worst = ?", -worst)
+    change_journal(path, "UPDATE evaluation SET mean = ?", -judged)
+    change_journal(path, "DELETE FROM run WHERE key = ?", CONFIRMED)
+    with RunFolder(path) as run:
+        assert (fitness_figure(run).axes[0].get_yscale() == "log") == is_log
+    drawn = describe_run(minimised, "reality")["curves"]
+    assert drawn["log"] == is_log
+    assert drawn["spent_axes"] == effort_axes(calls=True)
 
 
 def test_the_verbs_print_values_and_json_has_fitness(minimised):
