@@ -285,7 +285,7 @@ def pages_of(path: Path) -> set[str]:
 
 def flags_of(text: str) -> set[str]:
     """The flags that a file adds: those of `add_argument`, and of fields that are an `option`."""
-    fields = re.findall(r"^    (\w+): [^=\n]+= option\(", text, re.MULTILINE)
+    fields = re.findall(r"^    (\w+): [^=\n]+= (?:frozen_)?option\(", text, re.MULTILINE)
     return {*re.findall(r'add_argument\(\s*"(--[\w-]+)"', text), *(f"--{name.replace('_', '-')}" for name in fields)}
 
 

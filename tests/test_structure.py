@@ -186,3 +186,8 @@ def test_no_test_module_imports_another():
 def test_pages_that_docstrings_name_are_there():
     named = set().union(*map(structure.pages_of, sources(*SIDES)))
     assert {page for page in named if not (ROOT / page).exists()} == set()
+
+
+def test_the_flags_of_a_file_include_those_that_a_run_freezes():
+    found = structure.flags_of((ROOT / "coordinator/settings/config.py").read_text())
+    assert {"--subspace", "--driven"} <= found
