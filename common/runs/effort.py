@@ -1,4 +1,4 @@
-"""The effort of a run: environment steps in reality and in the dream, and slot time. Pages: export.md."""
+"""The effort of a run: environment steps in reality and in the dream, and slot time. Pages: export.md, results.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results of a controller on unseen seeds: one whole episode a seed, and their statistics. Pages: export.md."""
+"""Results of a controller on unseen seeds: a whole episode a seed, and statistics. Pages: export.md, results.md."""
 
 from __future__ import annotations
 

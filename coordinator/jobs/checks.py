@@ -2,7 +2,7 @@
 
 R32: a share of the accepted results is scored again on another host of the same class, and compared to the bit. Where
 two differ, further answers decide who is wrong; one difference alone accuses nobody. Each *voter* has one voice: a
-host, or in a secured fleet all that share a join file, for whose names one person may choose. Pages: trust.md.
+host, or in a secured fleet all that share a join file, as one person may name many. Pages: trust.md, measurements.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a bundle says of dreams in its world: where their rewards come from, and when they end. Pages: worlds.md."""
+"""What a bundle says of dreams: where their rewards come from, and when they end. Pages: worlds.md, takecover.md."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ An input has eight bits without a sign, a weight seven bits with one: the sums o
 form in sixteen bits, then never overflow. Where a sum becomes a single-precision number, its scale is so short that the
 product is exact: processors that add the bias in the same instruction then round as those that do not.
 
-A bundle that exists holds its own graphs. docs/explanation/determinism.md says which processors share bits.
+A bundle that exists holds its own graphs. Pages: determinism.md, measurements.md.
 """
 
 from collections.abc import Sequence

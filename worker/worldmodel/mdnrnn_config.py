@@ -1,4 +1,4 @@
-"""The configuration of an MDN-RNN, in a module of its own that needs no torch. Pages: presets.md, sources.md."""
+"""The configuration of an MDN-RNN, without torch. Pages: presets.md, sources.md, dreams-notes.md, takecover.md."""
 
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar

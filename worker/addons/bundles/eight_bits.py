@@ -1,4 +1,4 @@
-"""Turn a bundle into one whose encoder and LSTM multiply eight-bit integers. Pages: mixed-hosts.md."""
+"""Turn a bundle into one whose encoder and LSTM multiply eight-bit integers. Pages: mixed-hosts.md, measurements.md."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Find whom to evaluate, record or watch: a controller, or a baseline, which has no world model. Pages: sources.md."""
+"""Find whom to evaluate, record or watch: a controller, or a baseline. Pages: sources.md, baselines.md."""
 
 from __future__ import annotations
 
