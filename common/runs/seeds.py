@@ -15,7 +15,7 @@ CHOOSING_OFFSET, CONFIRMING_OFFSET = 10_000, 20_000
 TRAINING_FIRST = 2**20
 FOLDED_END = 2**31  # seeds below it fit into a signed number of 32 bits
 TRAINING_LAST = 2**53 - 1  # the largest integer that JSON represents exactly
-MAX_RESEEDS = 3  # times that a generation gets other seeds (docs/how-to/unattended.md)
+MAX_RESEEDS = 3  # times that a generation gets other seeds: docs/how-to/unattended.md, docs/how-to/troubleshooting.md
 
 
 def training_seed(run_seed: int, generation: int, episode: int) -> int:

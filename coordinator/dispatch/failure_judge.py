@@ -8,8 +8,8 @@ from dreamfleet.coordinator.dispatch.failures import Attempt
 from dreamfleet.coordinator.dispatch.member import Member
 from dreamfleet.coordinator.dispatch.pending_jobs import PendingJob, PendingJobs
 
-EQUAL_ATTEMPTS = 2  # that fail for one cause show that the episode does; docs/reference/python.md, `--on-failure`
-ANY_ATTEMPTS = 3  # that fail for several causes show it too
+EQUAL_ATTEMPTS = 2  # with one cause; said by `--on-failure`, docs/reference/python.md, docs/how-to/ask-tell.md
+ANY_ATTEMPTS = 3  # with several causes: either shows that the episode fails
 HOST_ATTEMPTS = 10  # that a host's shortage ends, over about eight minutes: no host has what the episode needs
 PAUSING_ATTEMPTS = 3  # on the only worker
 MAX_CAUSES = 20  # that are logged: a simulator may invent names without end
