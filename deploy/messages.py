@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from hashlib import sha1
 from pathlib import Path
 
@@ -35,9 +35,11 @@ NO_PROSE = re.compile(
     r"|^\s*\w+(?:, \w+)+\s*$"  # columns of a table
     r"|^outside \w+ \w+$"  # matplotlib's place of a legend
 )
-# What is data within a sentence: flags, numbers, names in backquotes, places that values come to, ends of lines.
+VALUE = "\ue000-\uf8ff"  # each stands for an expression of an f-string
+# What is data within a sentence: names in backquotes, flags, values and what they stand in, numbers, ends of lines, &&.
 DATA = re.compile(
-    r"`[^`]*`|--[a-z][a-z0-9-]*|--$|(?<!\w)\d[\d.,]*(?!\w)|%\(\w+\)[#0-9.+-]*[a-zA-Z]|%[#0-9.+-]*[a-zA-Z]|\{[^{}]*\}|\n"
+    rf"`[^`]*`|--[a-z{VALUE}][a-z0-9{VALUE}-]*|(?:[{VALUE}][:/.=]?)*[{VALUE}]|(?<!\w)\d[\d.,]*(?!\w)"
+    r"|%\(\w+\)[#0-9.+-]*[a-zA-Z]|%[#0-9.+-]*[a-zA-Z]|\{[^{}]*\}|\n|&&"
 )
 
 
@@ -123,7 +125,7 @@ class Messages(ast.NodeTransformer):
 
     def _literal(self, node: ast.Constant | ast.JoinedStr) -> ast.expr:
         text = template(node)
-        if text is None or not self._place or NO_PROSE.search(text):
+        if text is None or not self._place or NO_PROSE.search(text) or DATA.fullmatch(text):
             return node
         own = text if isinstance(node, ast.Constant) else own_words(node)
         if not (self._speaks and re.search(r"[a-z]{2,}", own)) and not PROSE.search(own):
@@ -133,18 +135,20 @@ class Messages(ast.NodeTransformer):
             return node
         place = f"{self._module}:{node.lineno}:{node.col_offset}"
         key = "m" + sha1(place.encode(), usedforsecurity=False).hexdigest()[:8]
-        parts: list[ast.expr] = [node] if isinstance(node, ast.Constant) else node.values
-        values: list[ast.expr] = [ast.Constant(key)]
-        for part in parts:
-            if isinstance(part, ast.FormattedValue):
-                values += [part] if template(values[-1]) == " --" else [ast.Constant(" "), part]
-            else:
-                values += [ast.Constant(f" {each}") for each in DATA.findall(str(template(part)))]
-        if isinstance(node, ast.JoinedStr):
-            new: ast.expr = ast.JoinedStr(values)
+        if isinstance(node, ast.Constant):
+            new: ast.expr = ast.Constant(" ".join([key, *DATA.findall(text)]))
         else:
-            new = ast.Constant("".join(str(template(each)) for each in values))
+            new = ast.JoinedStr(_with_data(key, node.values))
         return ast.fix_missing_locations(ast.copy_location(new, node))
+
+
+def _with_data(key: str, parts: Sequence[ast.expr]) -> list[ast.expr]:
+    """The parts of an f-string of a key and the data in these parts."""
+    values = {chr(0xE000 + number): part for number, part in enumerate(parts) if isinstance(part, ast.FormattedValue)}
+    marked = "".join(chr(0xE000 + number) if isinstance(part, ast.FormattedValue) else str(template(part))
+                     for number, part in enumerate(parts))  # fmt: skip
+    kept = " ".join([key, *DATA.findall(marked)])
+    return [values.get(each) or ast.Constant(each) for each in re.split(f"([{VALUE}])", kept)]
 
 
 def _is_code(node: ast.expr) -> bool:

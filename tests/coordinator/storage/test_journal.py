@@ -3,6 +3,7 @@ Tests file_watch.py, journal.py, journal_connection.py, journal_file.py, recall_
 verification_records.py and common/runs/records.py."""
 
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -321,7 +322,7 @@ def test_the_command_that_puts_a_rescued_journal_back_touches_no_other_file(tmp_
         watch.check(1e9)
     watch.close()
     journal.close()
-    subprocess.run(["sh", "-ec", str(left.value).partition("Continue with: ")[2]], check=True)
+    subprocess.run(["sh", "-ec", re.search(r" (rm .*)", str(left.value))[1]], check=True)
     assert not log.exists()
     assert [each.read_text() for each in others] == ["another program's"] * 2
     with RunFolder(folder) as run:

@@ -333,13 +333,13 @@ def test_each_job_has_its_own_result_in_plain_numbers_and_an_equal_share_of_the_
 
 
 @pytest.mark.parametrize(
-    ("scores", "said"), [([Score(1.0, 1)], "1 score of 3 episodes"), ([Score(1.0, 1)] * 2 + [None], "AttributeError")]
+    ("scores", "said"), [([Score(1.0, 1)], r"\b1\b.*\b3\b"), ([Score(1.0, 1)] * 2 + [None], "AttributeError")]
 )
 def test_invalid_scores_are_the_tasks_error(scores, said):
     done = score(*scores)
     assert [each.fitness for each in done.results] == [None] * 3
-    assert all(said in each.error.text for each in done.results)
-    assert said in done.failure.trace
+    assert all(re.search(said, each.error.text) for each in done.results)
+    assert re.search(said, done.failure.trace)
 
 
 @pytest.mark.parametrize("number", [float("nan"), float("inf"), 1e300])

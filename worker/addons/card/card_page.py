@@ -30,6 +30,7 @@ WHAT = {
     SCORES: "these scores, drawn",
     VIDEO: "a drive",
 }
+NAME_YOURS = "name yours before you publish, such as mit, apache-2.0 or cc-by-4.0"
 ORIGINS = {"steps": "run_steps", **{name: name for name in ("run_uid", "generation", IMPORTED, "layout")}}
 
 
@@ -89,7 +90,7 @@ def _describe_known_score(contents: CardContents) -> str:
 def _metadata(contents: CardContents, files: Sequence[str]) -> Iterator[str]:
     world = contents.world.removeprefix(f"{GYM}:")
     tags = ["reinforcement-learning", "dreamfleet", world, *(["world-models"] if contents.bundle is not None else [])]
-    yield from ("---", "license: other  # name yours before you publish, such as mit, apache-2.0 or cc-by-4.0")
+    yield from ("---", f"license: other  # {NAME_YOURS}")
     yield from ("library_name: dreamfleet", "pipeline_tag: reinforcement-learning", "tags:")
     yield from (f"- {_quoted(each)}" for each in [*tags, *(["onnx"] if DRIVER in files else [])])
     if contents.report is not None:

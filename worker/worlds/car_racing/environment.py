@@ -138,7 +138,8 @@ class CarRacing(_Base):  # type: ignore[misc]
             pixels = plural(int((ours != theirs).any(axis=-1).sum()), "pixel")
             raise DreamfleetError(
                 f"the native picture differs from gymnasium's by {pixels}, so its scores would be others: set "
-                f"{PICTURES}=gymnasium, and gymnasium draws; please report this, with pygame's and gymnasium's version"
+                f"`{PICTURES}=gymnasium`, and gymnasium draws; please report this, with pygame's and gymnasium's "
+                "version"
             )
 
     def _draw(self) -> NDArray[np.uint8]:

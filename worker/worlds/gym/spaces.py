@@ -81,7 +81,7 @@ def flatten_environment(
     if 0 in (environment.observation_space.shape or ()):
         raise UsageError(
             f"{name} observes no number ({observed}), and a controller acts on what it sees: let it observe one, such "
-            "as a constant 1, or search its actions as a function (function:MODULE:NAME)"
+            "as a constant 1, or search its actions as a function (`function:MODULE:NAME`)"
         )
     if isinstance(space, spaces.Discrete):
         _check_outputs(int(space.n), name)

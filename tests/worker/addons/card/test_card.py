@@ -169,7 +169,7 @@ def test_an_imported_controller_has_a_card(tmp_path):
 )  # fmt: skip
 def test_a_card_shows_each_name_as_it_is(name):
     controller = Controller(ControllerShape(1, 1), np.zeros(2, np.float32), f"gym:{name}", "", {IMPORTED: name})
-    report = replace(read_evaluation_report(REPORT), judge=name, version=name)
+    report = replace(read_evaluation_report(REPORT), judge=f"{name} judge", version=f"{name} version")
     text = "\n".join(describe_card(CardContents(controller, None, report, name), []))
     _, head, page = text.split("---\n", 2)
     found = yaml.safe_load(head)
@@ -183,8 +183,8 @@ def test_a_card_shows_each_name_as_it_is(name):
     assert tags <= {"h2", "p", "ul", "li", "img", "pre", "code", "video"}
     assert [each.text for each in elements[0].iter("code")] == [f"gym:{shown}", "dreamfleet", shown]
     scores = "".join(elements[2].itertext())
-    assert f"judged in {shown}" in scores
-    assert f"dreamfleet {shown}" in scores
+    assert f"{shown} judge" in scores
+    assert f"{shown} version" in scores
     assert draw_scores(report, name)
 
 

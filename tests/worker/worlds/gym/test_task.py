@@ -146,7 +146,7 @@ def test_what_an_environment_cannot_be_is_refused_with_the_reason(name, options,
 ])  # fmt: skip
 def test_options_of_a_file_that_the_world_cannot_have_are_refused(options):
     assignment = Assignment(replace(described_spec(CARTPOLE), options=options), None)
-    with pytest.raises(UsageError, match="options"):
+    with pytest.raises(UsageError, match=re.escape(f"{options!r:.200}")):
         find_task(CARTPOLE).world_of(assignment)
 
 
@@ -194,7 +194,7 @@ def without_actions(**_more):
     [
         (without_actions, "Box"),
         (lambda **_more: 1 / 0, "ZeroDivisionError: division by zero"),
-        (lambda **_more: sys.exit(3), r"exit\(3\)"),
+        (lambda **_more: sys.exit(3), r"\b3\b"),
     ],
 )
 def test_any_error_while_an_environment_is_made_is_one_line(monkeypatch, make, named):
