@@ -38,7 +38,7 @@ def plural(count: float, noun: str, nouns: str = "") -> str:
 def format_number(value: float | None, sign: str = "") -> str:
     """Format a measured number in four significant digits, from a thousand on all whole ones; - if it is missing.
 
-    `sign` is `+` if positive numbers show theirs.
+    `sign` is `+` if positive numbers show theirs. What is tiny or huge counts alike in dom.js.
 
     >>> format_number(875.62), format_number(-3.98712), format_number(0.00004127), format_number(12345.6)
     ('875.6', '-3.987', '4.127e-05', '12,346')

@@ -104,9 +104,13 @@ def _ways(path: Path) -> Iterator[Path]:
 def _is_mine(path: Path, *, sticky: bool) -> bool:
     """Whether only this user and root may write there, or replace what they own if it is `sticky`.
 
-    A group is the user's alone if it has the user's number: others may share the primary one. Nobody writes to a link.
+    Nobody writes to a link.
     """
     found = path.lstat()
-    by_group = bool(found.st_mode & stat.S_IWGRP) and found.st_gid != os.geteuid()
-    shared = (by_group or found.st_mode & stat.S_IWOTH) and not (sticky and found.st_mode & stat.S_ISVTX)
+    shared = others_write(found) and not (sticky and found.st_mode & stat.S_ISVTX)
     return found.st_uid in (os.geteuid(), 0) and (stat.S_ISLNK(found.st_mode) or not shared)
+
+
+def others_write(found: os.stat_result) -> bool:
+    """Whether others may write there. A group is the user's alone if it has the user's number; spawn's agent.py too."""
+    return bool(found.st_mode & (stat.S_IWOTH | (0 if found.st_gid == os.geteuid() else stat.S_IWGRP)))

@@ -44,7 +44,7 @@ SINGLE_PRECISION = "single_precision"  # in the provenance of a bundle of eight 
 REQUIRED = (ENCODER, DECODER, DREAM_GRAPH, INITIAL_LATENTS_PART)  # parts without which it is no bundle
 MAX_BUNDLE = 256 << 20  # bytes, of the file and of its members together; docs/how-to/security.md and R2 say it too
 LIMITS = ArchiveLimits(MAX_BUNDLE)  # docs/reference/protocol.md, R2
-_MAX_MANIFEST = 1_000_000
+MAX_MANIFEST = 1_000_000
 MAX_ARRAY = 64 << 20  # bytes of a part that is an array: it is copied as float32 when it is read
 MAX_RECORDED_STATES = 16_384  # states; 19 MB with the default layers
 
@@ -257,8 +257,8 @@ def write_bundle(path: Path, manifest: BundleManifest, parts: Mapping[str, bytes
     """Write a bundle atomically, and open it."""
     hashes = {name: hashlib.sha256(data).hexdigest() for name, data in sorted(parts.items())}
     text = json.dumps({**to_plain(manifest), "parts": hashes}, indent=1, sort_keys=True)
-    if len(text) > _MAX_MANIFEST:
-        raise BundleError(f"the manifest of {path} would have {len(text)} bytes; at most {_MAX_MANIFEST} are read")
+    if len(text) > MAX_MANIFEST:
+        raise BundleError(f"the manifest of {path} would have {len(text)} bytes; at most {MAX_MANIFEST} are read")
     with atomic_write(path) as file:
         write_archive(file, [(MANIFEST, text.encode()), *sorted(parts.items())])
     return Bundle.open(path)
@@ -318,7 +318,7 @@ def _read_part(archive: Archive, path: Path, manifest: BundleManifest, name: str
 
 def _read_manifest(archive: Archive, path: Path) -> BundleManifest:
     try:
-        plain = json.loads(archive.read(MANIFEST, _MAX_MANIFEST))
+        plain = json.loads(archive.read(MANIFEST, MAX_MANIFEST))
         if plain["format"] != FORMAT:
             raise BundleError(f"{path} has bundle format {plain['format']!r:.20}; this version reads {FORMAT}")
         manifest = from_plain(BundleManifest, plain)

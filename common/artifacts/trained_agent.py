@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
+from dreamfleet.common.artifacts.bundle import MAX_MANIFEST
 from dreamfleet.common.artifacts.onnx_checks import find_fault
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.common.files.archives import Archive, ArchiveLimits, DamagedArchiveError, open_archive, write_archive
@@ -24,7 +25,6 @@ FORMAT = 1
 MANIFEST, NETWORK = "agent.json", "network.onnx"
 MAX_BYTES = 256 << 20  # of the file, and of its members together; docs/how-to/security.md says it too
 _LIMITS = ArchiveLimits(MAX_BYTES, members=8)
-_MAX_MANIFEST = 1_000_000
 MAX_FRAME_SKIP, MAX_STATE_SIZE = 10**6, 10**6
 
 Choice = Annotated[tuple[float, ...], Meta(min_length=1, max_length=1000)]
@@ -96,7 +96,7 @@ class TrainedAgent(Displayed):
 
     @classmethod
     def _parse(cls, archive: Archive) -> TrainedAgent:
-        about = json.loads(archive.read(MANIFEST, _MAX_MANIFEST))
+        about = json.loads(archive.read(MANIFEST, MAX_MANIFEST))
         if not isinstance(about, dict):
             raise ValueError(f"{MANIFEST} is not a JSON object")
         if (found := about.pop("format")) != FORMAT:

@@ -19,9 +19,9 @@ from rich.progress import (
 )
 from rich.table import Column, Table
 
+from dreamfleet.common.cli.output import UNLIMITED_WIDTH
 from dreamfleet.common.host.foreign_code import answer_kept
 
-UNLIMITED_WIDTH = 10_000  # columns: a console on which nothing is truncated
 LARGEST_TOTAL = 10**15  # items: of more, rich cannot estimate the remaining time
 SPEED_PERIOD = 600.0  # seconds of the past that the remaining time is estimated from: steps may take a minute
 LOG_INTERVAL = 30.0  # seconds between two lines where no bar can be drawn, such as in a log

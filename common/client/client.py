@@ -225,13 +225,7 @@ class Client(Displayed):
         about = f"?host={keys.check_worker_name(host)}" if host else ""
         for reply in self.session.get(keys.control(keys.check_run_name(run), verb) + about, timeout=QUERY_TIMEOUT):
             if reply.ok is not None:
-                try:
-                    answer = decode_json(ControlReply, reply.ok.payload.to_bytes())
-                except MalformedError as error:
-                    raise MalformedError(
-                        f"the coordinator of run {run} has another version ({error}): install the same dreamfleet on "
-                        "both sides"
-                    ) from error
+                answer = read_answer(ControlReply, run, reply.ok.payload.to_bytes())
                 if not answer.accepted:
                     raise RefusedError(answer.why)
                 return answer.again
@@ -325,3 +319,13 @@ def _decode_controller(about: dict[str, Any], data: bytes) -> Controller:
     if controller.sha256 != about["sha256"]:
         raise ControllerError("the controller arrived damaged; ask again")
     return controller
+
+
+def read_answer(kind: type[T], run: str, payload: bytes) -> T:
+    """What a coordinator answers to a command; `MalformedError` if its version is another one."""
+    try:
+        return decode_json(kind, payload)
+    except MalformedError as error:
+        raise MalformedError(
+            f"the coordinator of run {run} has another version ({error}): install the same dreamfleet on both sides"
+        ) from error

@@ -79,7 +79,7 @@ class Candidate:
 
     @property
     def has_failed(self) -> bool:
-        """Whether an episode failed for good, so that none is wanted any more."""
+        """Whether an episode failed for good, so that none is wanted any more; live.js counts alike."""
         return self.wanted == 0
 
 

@@ -42,7 +42,7 @@ def is_worker_identity(identity: str) -> bool:
 
 def host_of(worker: str) -> str:
     """The name in a worker's identity, without its process: its later processes, on the same host, share it."""
-    return worker.partition("/")[0]
+    return worker.partition("/")[0]  # counts alike: coordinator/addons/dashboard/page/live.js
 
 
 def new_worker_identity(name: str | None = None) -> str:

@@ -52,7 +52,7 @@ class Effort:
     def describe(self, task: str) -> str:
         """A text for display, of a run in this task: a function has calls, and no steps."""
         dreamt = f", {format_steps(self.dreamt)} dreamt" if self.dreamt else ""
-        steps = "calls" if is_function_task(task) else "steps in reality"
+        steps = "calls" if is_function_task(task) else "steps in reality"  # counts alike: comparison.py, stored_runs.py
         return f"{format_steps(self.steps)} {steps}{dreamt}, {self.core_hours:,.3g} core-hours"
 
 

@@ -20,7 +20,7 @@ from dreamfleet.common.protocol.function_values import is_minimised, value_of
 from dreamfleet.common.protocol.measures import MAX_AXES, MAX_AXIS
 from dreamfleet.common.protocol.messages import Horizon, Packages, Patience, Share, TaskSpec
 from dreamfleet.common.runs.standard_error import error_from_population_std, error_from_sample_std, format_with_error
-from dreamfleet.common.schema.validation import OPTIONAL, Count, MalformedError, from_plain, to_plain
+from dreamfleet.common.schema.validation import OPTIONAL, Count, MalformedError, added_option, from_plain, to_plain
 
 MAX_STAGES = 32  # of a schedule; statuses contain them too
 PopulationSize = Annotated[int, Meta(ge=2, le=10**5)]
@@ -33,29 +33,24 @@ EpisodeCount = Annotated[int, Meta(ge=1, le=2**63 - 1)]  # at least 1: a standar
 AxisText = Annotated[str, Meta(min_length=1, max_length=MAX_AXIS)]
 
 
-def stage_option(default: Any, text: str) -> Any:
-    """A key of a `[[stage]]`, which is stored only where it differs from its default."""
-    return field(default=default, metadata={**OPTIONAL, "help": text})
-
-
 @dataclass(frozen=True)
 class StageSettings:
     """One `[[stage]]` of a schedule: what ends it, and the settings that it changes."""
 
     # The first of these that is reached ends it. 0 or None: never.
-    generations: Count = stage_option(0, "generations of the stage")
-    steps: Count = stage_option(0, "environment steps of the stage")
-    score: float | None = stage_option(None, "an evaluated score of a mean that was sampled in the stage")
+    generations: Count = added_option(0, "generations of the stage")
+    steps: Count = added_option(0, "environment steps of the stage")
+    score: float | None = added_option(None, "an evaluated score of a mean that was sampled in the stage")
     # None: as in the stage before.
-    horizon: Horizon | None = stage_option(None, "as --horizon")
-    patience: Patience | None = stage_option(None, "as --patience")
-    episodes: EpisodesPerCandidate | None = stage_option(None, "as --episodes")
-    population: PopulationSize | None = stage_option(None, "as --population; a change begins a new search at the mean")
-    sigma0: float | None = stage_option(None, "as --sigma0; begins a new search at the mean")
-    racing: bool | None = stage_option(None, "as --racing")
-    driven: Share | None = stage_option(None, "as --driven")
-    all_parameters: bool = stage_option(False, "leave the run's subspace at the mean; needs a sigma0")
-    restart: bool = stage_option(
+    horizon: Horizon | None = added_option(None, "as --horizon")
+    patience: Patience | None = added_option(None, "as --patience")
+    episodes: EpisodesPerCandidate | None = added_option(None, "as --episodes")
+    population: PopulationSize | None = added_option(None, "as --population; a change begins a new search at the mean")
+    sigma0: float | None = added_option(None, "as --sigma0; begins a new search at the mean")
+    racing: bool | None = added_option(None, "as --racing")
+    driven: Share | None = added_option(None, "as --driven")
+    all_parameters: bool = added_option(False, "leave the run's subspace at the mean; needs a sigma0")
+    restart: bool = added_option(
         False, "search anew from the run's first mean, unless the stage before reached its score"
     )
 

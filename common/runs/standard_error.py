@@ -32,7 +32,7 @@ def error_from_population_std(std: float, count: int) -> float | None:
 def score_digits(mean: float, error: float | None) -> int:
     """Decimals of a score: one, or as many as show the first figure of a small error.
 
-    Without an error the mean has four significant digits, and at least one decimal.
+    Without an error the mean has four significant digits, and at least one decimal. `runs.js` counts alike.
 
     >>> score_digits(875.62, 4.73), score_digits(0.1234, 0.0031), score_digits(-3.98712, None)
     (1, 3, 3)

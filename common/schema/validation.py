@@ -8,7 +8,7 @@ import math
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, field, fields, is_dataclass
 from functools import cache
 from threading import Lock
 from types import NoneType, UnionType
@@ -27,6 +27,12 @@ SCHEMA = "schema"  # the reason of whatever does not fit its type hints (docs/re
 MAX_SENTENCE = 200  # characters of why it does not: a peer may choose the name of a field
 OPTIONAL = {"optional": True}
 """`field(default=..., metadata=OPTIONAL)`: a missing field has its default, and a default is not written."""
+
+
+def added_option(default: Any, text: str) -> Any:
+    """An `OPTIONAL` field that is a flag or a key of a file, with its help."""
+    return field(default=default, metadata={**OPTIONAL, "help": text})
+
 
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Finite = Annotated[float, Meta(ge=-sys.float_info.max, le=sys.float_info.max)]

@@ -31,6 +31,7 @@ from dreamfleet.common.protocol.batches import (
 )
 from dreamfleet.common.protocol.messages import MAX_PART, UploadPart
 from dreamfleet.common.runs.seeds import remark_on_seeds, training_seed
+from dreamfleet.coordinator.dispatch.failures import LONGEST_ERROR
 from dreamfleet.coordinator.jobs.generation import Generation
 from dreamfleet.coordinator.jobs.upload_assembler import TOO_MANY, UploadAssembler
 from dreamfleet.coordinator.run.external_generations import CANCELLED, ExternalGenerations
@@ -41,7 +42,6 @@ from dreamfleet.coordinator.storage.batch_records import StoredBatch
 MAX_WAITING = 256  # batches; docs/how-to/ask-tell.md
 MAX_WAITING_SIZE = 8 * MAX_BATCH  # bytes of their vectors
 PAGE_BYTES = 30_000  # of a reply's scores and errors
-LONGEST_ERROR = 300  # characters
 log = logging.getLogger(__name__)
 Parameters = Callable[[str], str | None]
 

@@ -10,7 +10,7 @@ WAITS_FOR_WORKERS, WAITS_FOR_BATCH = "waiting for workers", "waiting for a batch
 
 
 class ShownState(NamedTuple):
-    """A state in a word, and why the run is paused or has ended, in words; `why` is empty in other states.
+    """A state in a word, which `live.js` knows, and why a run is paused or has ended; `why` is empty in other states.
 
     `pauses` is what paused it, the latest first; empty where the journal or differing hosts make it wait.
     """

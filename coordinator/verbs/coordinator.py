@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from dreamfleet.common.cli.config import Table, configured_values, load
 from dreamfleet.common.cli.global_config import load_credentials
 from dreamfleet.common.cli.output import print_answer
-from dreamfleet.common.errors import UsageError
+from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.host.logs import label_logs
 from dreamfleet.common.host.resource_limits import check_room_for_session, raise_open_file_limit
 from dreamfleet.common.host.standard_streams import make_stderr_nonblocking
@@ -48,7 +48,6 @@ ELSEWHERE = {
     "--slots": "slots are a worker's: `dreamfleet worker --run NAME --slots N`",
     "--log-to": "give DREAMFLEET_NETWORK_LOG_TO=tensorboard, or `log_to` in a file's [network]",
 }
-LEFT_OPEN = 130
 # Python looks for cycles after every 700 new objects by default. A generation's jobs are many and have none.
 COLLECTION = (100_000, 10, 10)
 log = logging.getLogger("dreamfleet.coordinator")
@@ -148,7 +147,7 @@ def serve_request(
     gc.set_threshold(*COLLECTION)
     run = serve_run(request, _on_signals)
     _on_signals(None)  # its last word may wait for a reader of stdout
-    outcome = ExitReport(code=LEFT_OPEN) if run.state.ended is None else on_ended()
+    outcome = ExitReport(code=StoppedError.exit_code) if run.state.ended is None else on_ended()
     _report(args, run, request, outcome, nothing_new=len(run.history) == before)
     return outcome.code
 

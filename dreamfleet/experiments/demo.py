@@ -24,7 +24,7 @@ from rich.text import Text
 from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.cli.output import print_rows
-from dreamfleet.common.cli.progress import progress_bar
+from dreamfleet.common.cli.progress import LOG_INTERVAL, progress_bar
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.client.run_view import LiveRunView
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
@@ -47,9 +47,9 @@ from dreamfleet.coordinator.addons.status.status_panel import RunPanel
 from dreamfleet.coordinator.settings.config import NO_SUBSPACE
 from dreamfleet.experiments.local import command_lines
 from dreamfleet.experiments.local.local_run import START_SECONDS, LocalRun, has_begun
+from dreamfleet.worker.addons.evaluation.known_score import median_drive
 
 REFRESH = 0.5
-LOG_INTERVAL = 30.0  # seconds between two lines where no panel can be drawn, such as in a log
 PAGE_PACKAGES = ("plotly", "starlette", "uvicorn")
 PLOT, VIDEO, SCHEDULE = "fitness.png", "drive.mp4", "stages.toml"
 SUBSPACE_SIGMA0, FULL_SIGMA0 = 0.3, 0.1  # first step sizes from zero: in a subspace, and of all parameters
@@ -287,11 +287,6 @@ class Demo:
 
     def _print(self, text: str) -> None:
         self._console.print(text, style="bold", markup=False, highlight=False, soft_wrap=True)
-
-
-def median_drive(drives: Mapping[int, float]) -> tuple[int, float]:
-    """The track and score of the middle drive, neither the best nor a crash; of an even number the lower one."""
-    return sorted(drives.items(), key=lambda drive: (drive[1], drive[0]))[(len(drives) - 1) // 2]
 
 
 def _evaluation_flags(every: int, tracks: int, confirming: int) -> dict[str, object]:

@@ -37,7 +37,6 @@ from dreamfleet.experiments.local.kept_words import check_announced
 from dreamfleet.experiments.local.local_run import ALONE, POLL_INTERVAL, LocalFleet, LocalRun, has_begun, task_flags
 from dreamfleet.experiments.local.run_arguments import RunArguments
 
-MOST_WORKERS = 1024  # processes of one slot
 STARTING = "starting.lock"  # held while a program starts and serves a run
 STATUS_INTERVAL = 2.0  # seconds between looks whether the run is paused
 # Flags of `coordinator` that are no settings here: a secured fleet is started from the command line.
@@ -172,7 +171,7 @@ class StartedRun(StoredRun):
             status = self.client.status(self.name)
         except ConnectionFailedError:  # it is just ending
             return
-        if status.state == "paused" and status.pauses != (PauseKind.BY_HAND,):
+        if status.state == "paused" and status.pauses != (PauseKind.BY_HAND,):  # as a sweep decides
             errors = tuple(text for each in status.failures for text in each.errors.values())
             raise RunPausedError(f"run {self.name} is paused: {status.why}; its logs are in {self.path}", errors)
 
@@ -226,8 +225,8 @@ def start_run_in(
 ) -> StartedRun:
     """As `start_run`, with variables of `environment` for the processes, over this one's."""
     slots = usable_cores() if workers is None else workers
-    if type(slots) is not int or not 0 <= slots <= MOST_WORKERS:
-        raise UsageError(f"workers must be a whole number from 0 to {MOST_WORKERS}, not {workers!r}")
+    if type(slots) is not int or not 0 <= slots <= command_lines.MOST_WORKERS:
+        raise UsageError(f"workers must be a whole number from 0 to {command_lines.MOST_WORKERS}, not {workers!r}")
     flags, listen = check_settings(settings), settings.pop("listen", ())
     fleet = LocalFleet.of((listen,) if isinstance(listen, str) else tuple(listen), slots, (), ())
     folder = Path(default_runs_dir() if runs_dir is None else runs_dir).absolute()

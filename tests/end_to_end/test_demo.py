@@ -16,7 +16,8 @@ from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
 from dreamfleet.common.runs.standard_error import format_with_error
-from dreamfleet.experiments.demo import PLANS, Demo, DemoConfig, median_drive, plan_runs
+from dreamfleet.experiments.demo import PLANS, Demo, DemoConfig, plan_runs
+from dreamfleet.worker.addons.evaluation.known_score import median_drive
 from tests.support.processes import call_here, runs
 from tests.support.tables import cells
 

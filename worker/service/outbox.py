@@ -7,9 +7,11 @@ import hashlib
 from collections import OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from dreamfleet.common.protocol.messages import MAX_PART, Result
 
+P = TypeVar("P")
 MAX_RESULTS = 64  # results in one message
 MAX_ERROR_BYTES = 32 * 1024  # of all error texts in one message; a result without one is far below a kilobyte
 MAX_BACKOFF = 8  # the longest pause between two sendings of a result, in multiples of the repeat interval
@@ -27,16 +29,28 @@ class PendingResult:
     times_sent: int = 0
 
 
-class Outbox:
-    """Results without a verdict. Each is sent at once, and again with growing pauses until its verdict arrives."""
+class Unanswered(Generic[P]):
+    """What jobs have left and no verdict has answered, by the jobs' digests, oldest first."""
 
     def __init__(self, repeat: float) -> None:
-        """`repeat` is the first pause, in seconds."""
+        """`repeat` is the first pause until it is sent again, in seconds."""
         self.repeat = repeat
-        self._pending: OrderedDict[bytes, PendingResult] = OrderedDict()
+        self._pending: OrderedDict[bytes, P] = OrderedDict()
 
     def __len__(self) -> int:
         return len(self._pending)
+
+    def acknowledge(self, digests: Iterable[bytes]) -> None:
+        """Drop what has a verdict, whatever it is.
+
+        R6: only a verdict ends the repetition, because the coordinator sends it after its journal has the result.
+        """
+        for digest in digests:
+            self._pending.pop(digest, None)
+
+
+class Outbox(Unanswered[PendingResult]):
+    """Results without a verdict. Each is sent at once, and again with growing pauses until its verdict arrives."""
 
     @property
     def digests(self) -> list[bytes]:
@@ -46,14 +60,6 @@ class Outbox:
     def add(self, result: Result) -> None:
         """Add the result of a finished job."""
         self._pending[result.digest] = PendingResult(result)
-
-    def acknowledge(self, digests: Iterable[bytes]) -> None:
-        """Drop the results that have a verdict, whatever it is.
-
-        R6: only a verdict ends the repetition, because the coordinator sends it after its journal has the result.
-        """
-        for digest in digests:
-            self._pending.pop(digest, None)
 
     def resend_all(self) -> None:
         """Make every result due now."""
@@ -120,34 +126,22 @@ class PendingUpload:
     next_round_at: float = 0.0
 
 
-class UploadQueue:
+class UploadQueue(Unanswered[PendingUpload]):
     """Rollout files without a verdict. Each is sent whole at once, and again in rounds with growing pauses.
 
     R7: a lost part comes with the next round. Bursts and growing pauses keep a slow link free.
     """
 
-    def __init__(self, repeat: float) -> None:
-        """`repeat` is the first pause between rounds, in seconds."""
-        self._repeat = repeat
-        self._pending: OrderedDict[bytes, PendingUpload] = OrderedDict()
-        self._next_burst_at = 0.0
-
-    def __len__(self) -> int:
-        return len(self._pending)
+    _next_burst_at = 0.0
 
     def add(self, digest: bytes, data: bytes) -> None:
         """Add the file that a job has left."""
-        self._pending[digest] = PendingUpload(hashlib.sha256(data).digest(), data, self._repeat)
-
-    def acknowledge(self, digests: Iterable[bytes]) -> None:
-        """Drop the files of jobs that have a verdict, whatever it is."""
-        for digest in digests:
-            self._pending.pop(digest, None)
+        self._pending[digest] = PendingUpload(hashlib.sha256(data).digest(), data, self.repeat)
 
     def resend_all(self) -> None:
         """Start each file again: the coordinator that received its parts is gone."""
         for each in self._pending.values():
-            each.offset, each.next_round_at, each.pause = 0, 0.0, self._repeat
+            each.offset, each.next_round_at, each.pause = 0, 0.0, self.repeat
 
     def due(self, now: float) -> list[FilePart]:
         """Parts to send now, oldest file first."""
@@ -167,4 +161,4 @@ class UploadQueue:
         each.offset += MAX_PART
         if each.offset >= len(each.data):
             each.offset, each.next_round_at = 0, now + each.pause
-            each.pause = min(2 * each.pause, max(MAX_ROUND_DELAY, self._repeat))
+            each.pause = min(2 * each.pause, max(MAX_ROUND_DELAY, self.repeat))

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from itertools import takewhile
 
+from dreamfleet.common.client.client import SHOWN_RUNS
 from dreamfleet.common.errors import DreamfleetError, RefusedError
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.printable import join_some, one_line, truncate
@@ -11,7 +12,6 @@ from dreamfleet.common.transport.network import Network
 from dreamfleet.worker.service.config import WorkerConfig
 
 WAIT_LIMIT = 30.0  # seconds after which a worker says how to start a coordinator
-SHOWN_RUNS = 4
 
 
 def describe_failure(error: BaseException) -> str:

@@ -25,7 +25,7 @@ from dreamfleet.worker.worldmodel.export import export_encoder
 from dreamfleet.worker.worldmodel.inference import open_graph
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 
-ENCODED = "encoded"
+ENCODED = "encoded"  # counts alike: dreamfleet/experiments/iteration/layout.py
 BATCH = 100  # pictures
 ENCODER = ("encoder.", "mu.", "logvar.")  # prefixes of its weights' names
 

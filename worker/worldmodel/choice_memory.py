@@ -31,7 +31,7 @@ class ChoiceMemory:
     def features(self, state: Floats) -> Floats:
         """The controller's inputs from it `(N, 2 * outputs)`: the last choice, and its difference to the one before."""
         last, before = (self._actions.to_outputs(each) for each in (self._last(state), self._before(state)))
-        return np.concatenate([last, last - before], axis=1)
+        return np.concatenate([last, last - before], axis=1)  # counts alike: worker/addons/card/driver_graph.py
 
     def choose(self, state: Floats, decide_anew: Callable[[], Floats]) -> Floats:
         """The choice of each row `(N, actions)`: a new one by `decide_anew` where it is due, else the held one."""

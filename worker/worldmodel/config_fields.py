@@ -1,18 +1,12 @@
 """Fields of a model's configuration: the bounds of its sizes, and factors that weight the parts of a loss."""
 
-from dataclasses import field
 from typing import Any
 
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.schema.validation import OPTIONAL
+from dreamfleet.common.schema.validation import added_option
 
 LARGEST = 2**14  # of a layer, a kernel or a window: beyond it torch overflows, or the memory
 LEAST, MOST = 1e-6, 1e6  # beyond these, float32 loses the smaller part of the sum
-
-
-def added_option(default: Any, text: str) -> Any:
-    """A field that a later version added: it is not serialised at its default."""
-    return field(default=default, metadata={**OPTIONAL, "help": text})
 
 
 def loss_factor(text: str) -> Any:

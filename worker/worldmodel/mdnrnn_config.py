@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
-from dreamfleet.worker.worldmodel.config_fields import added_option, check_factors, check_sizes, loss_factor
+from dreamfleet.common.schema.validation import added_option
+from dreamfleet.worker.worldmodel.config_fields import check_factors, check_sizes, loss_factor
 
 Reward = Literal["none", "positive", "notebook", "value"]
 Probability = TypeVar("Probability", float, NDArray[np.float32], NDArray[np.float64])

@@ -7,7 +7,8 @@ from typing import Literal, NamedTuple
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import plural
-from dreamfleet.worker.worldmodel.config_fields import MOST, added_option, check_factors, check_sizes, loss_factor
+from dreamfleet.common.schema.validation import added_option
+from dreamfleet.worker.worldmodel.config_fields import MOST, check_factors, check_sizes, loss_factor
 
 LEAK = 0.2  # slope of the leaky activation below zero
 KERNEL, STRIDE = 4, 2

@@ -28,6 +28,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric.ec import SECP256R1, EllipticCurvePrivateKey, generate_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from dreamfleet.common.addons.own_modules import others_write
 from dreamfleet.common.errors import AccessError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write, check_output_path, reporting_write_errors
 from dreamfleet.common.files.locks import open_lock, wait_for_lock
@@ -220,12 +221,8 @@ def _check_mine(folder: Path) -> None:
             raise AccessError(
                 f"{path} is another user's: make an authority in a folder of yours, --access-dir names it"
             )
-        refused = (
-            stat.S_IWOTH if found.st_gid == os.geteuid() else stat.S_IWOTH | stat.S_IWGRP
-        )  # a private group writes
-        if path.name in (_KEY, _SECRET):
-            refused = stat.S_IRWXG | stat.S_IRWXO
-        if found.st_mode & refused:
+        is_open = path.name in (_KEY, _SECRET) and bool(found.st_mode & (stat.S_IRWXG | stat.S_IRWXO))
+        if is_open or others_write(found):
             raise AccessError(
                 f"others may change or read {path}: chmod go= {quote(str(path))}; if they did, make another authority"
             )

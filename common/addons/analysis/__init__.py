@@ -3,4 +3,4 @@
 Pages: export.md, files.md, quality-diversity.md.
 """
 
-__all__ = ["scored_history", "drawn_values", "comparison", "run_archive", "fitness_chart", "learning"]
+__all__ = ["scored_history", "comparison", "run_archive", "fitness_chart", "learning"]

@@ -141,7 +141,7 @@ def at_equal_budget(sides: Sequence[ComparedRun]) -> list[EqualBudget]:
 
 
 def budget_name(sides: Sequence[ComparedRun], what: str) -> str:
-    """A kind of budget in words: a function has calls, and no steps."""
+    """A kind of budget in words: a function has calls, and no steps; counts alike: runs/effort.py."""
     return "calls" if what == STEPS and all(is_function_task(each.settings.task.task) for each in sides) else what
 
 

@@ -11,9 +11,8 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
-from dreamfleet.common.addons.analysis.drawn_values import log_foot, spread_of
 from dreamfleet.common.addons.analysis.learning import Point
-from dreamfleet.common.addons.analysis.scored_history import scored_history
+from dreamfleet.common.addons.analysis.scored_history import log_foot, scored_history, spread_of
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.tasks import DREAM, is_function_task
 from dreamfleet.common.runs.records import StoredConfirmation, StoredEvaluation, in_values

@@ -18,7 +18,7 @@ from dreamfleet.common.protocol.measures import Axis
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 
-EXPLORERS = ("cma-me", "map-elites")  # optimisers whose candidates seek new cells, and not a better mean
+EXPLORERS = ("cma-me", "map-elites")  # as pyproject.toml names them: candidates seek new cells, and not a better mean
 NEAREST = 5  # filled cells that the error for an empty one names
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import zenoh
 
-from dreamfleet.common.client.client import Client
+from dreamfleet.common.client.client import QUERY_TIMEOUT, Client, read_answer
 from dreamfleet.common.errors import ConnectionFailedError
 from dreamfleet.common.protocol import keys
 from dreamfleet.common.protocol.batches import (
@@ -27,7 +27,6 @@ from dreamfleet.common.protocol.messages import MAX_PART
 from dreamfleet.common.schema.validation import MalformedError
 from dreamfleet.common.transport.query import GRACE
 
-QUERY_TIMEOUT = 3.0  # seconds
 LEAST_RATE = 1e6  # bytes of a batch that a busy coordinator stores a second
 PARTS_AT_ONCE = 32  # of a body: what a coordinator's queue holds, many times over
 
@@ -99,7 +98,7 @@ class BatchClient:
             if reply is None:
                 left -= 1
             elif reply.ok is not None:
-                found.append(_decode(run, reply.ok.payload.to_bytes()))
+                found.append(read_answer(BatchReply, run, reply.ok.payload.to_bytes()))
         if refused := next((each for each in found if each.refused), None):
             raise BatchError(refused.refused, refused.why)
         is_stored = any(each.state not in ("", "uploading") for each in found)
@@ -109,15 +108,6 @@ class BatchClient:
                 f"`dreamfleet coordinator --resume {run} --runs-dir FOLDER` continues a run that was stopped or killed"
             )
         return found
-
-
-def _decode(run: str, payload: bytes) -> BatchReply:
-    try:
-        return decode_json(BatchReply, payload)
-    except MalformedError as error:
-        raise MalformedError(
-            f"the coordinator of run {run} has another version ({error}): install the same dreamfleet on both sides"
-        ) from error
 
 
 def is_final(reply: BatchReply) -> bool:

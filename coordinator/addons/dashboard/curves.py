@@ -8,14 +8,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from dreamfleet.common.addons.analysis.drawn_values import describe_all_steps, effort_axes, goal_of, log_foot, spread_of
 from dreamfleet.common.addons.analysis.run_archive import exploration_note
+from dreamfleet.common.addons.analysis.scored_history import effort_axes, log_foot, spread_of, steps_text, value_axis
 from dreamfleet.common.printable import plural
-from dreamfleet.common.protocol.function_values import (
-    fitness_word,
-    is_minimised,
-    value_of,
-)
+from dreamfleet.common.protocol.function_values import fitness_word, value_of
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import DREAM, is_function_task
 from dreamfleet.common.runs.effort import Effort
@@ -69,12 +65,13 @@ def curves(
     dreamt, every = settings.task.task == DREAM, settings.evaluate_every
     often = "of each generation" if every == 1 else f"every {every} generations"
     stages = begun_stages(settings, data.history, data.evaluations)
-    steps = describe_all_steps(stages, task, data.episode_limit)
+    steps = steps_text(stages, task, data.episode_limit)
     band, looks = _band(rows, quartiles, task), downsample(data.evaluations)
     reported = [] if data.confirmed is None else [data.confirmed]
     confirmed = _judged(reported, [len(data.history) - 1] * len(reported), task, spent)
     begin = log_foot(rows, [in_values(each, task) for each in looks], task)
     is_log, foot = begin is not None, -math.inf if begin is None else begin
+    axis = value_axis(task, is_log=is_log) if is_function_task(task.task) else ""
     drawn: dict[str, Any] = {
         "step": sampling_step(len(data.history)),
         "generation": [each.number for each in rows],
@@ -88,12 +85,10 @@ def curves(
         "confirmed": {name: column[0] for name, column in confirmed.items()} if reported else None,
         "stages": [each.since for each in stages[1:]],
         "dreamt": dreamt,
-        "fitness_axis": _value_axis(task, is_log=is_log) if is_function_task(task.task) else f"fitness over {steps}",
+        "fitness_axis": axis or f"fitness over {steps}",
         "score_word": fitness_word(task),
         "log": is_log,
-        "score_axis": _value_axis(task, is_log=is_log)
-        if is_function_task(task.task)
-        else f"score{' in reality' * dreamt}, mean of {plural(settings.evaluation_episodes, word)}",
+        "score_axis": axis or f"score{' in reality' * dreamt}, mean of {plural(settings.evaluation_episodes, word)}",
         "coming": "Once the first generation closes: the mean, the best and the spread of its candidates"
         f"{f', and the evaluated mean {often}' if every else ''}.",
         "note": exploration_note(settings),
@@ -102,10 +97,6 @@ def curves(
         drawn |= _effort_columns([spent[each.number] for each in rows if each.number < len(spent)])
         drawn["spent_axes"] = effort_axes(calls=is_function_task(task.task))
     return drawn
-
-
-def _value_axis(task: TaskSpec, *, is_log: bool) -> str:
-    return f"value: {goal_of(minimised=is_minimised(task))}{' (log scale)' if is_log else ''}"
 
 
 def _band(rows: Sequence[StoredGeneration], quartiles: Quartiles | None, task: TaskSpec) -> list[tuple[float, float]]:

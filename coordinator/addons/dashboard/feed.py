@@ -7,7 +7,7 @@ from collections.abc import AsyncGenerator
 from dreamfleet.common.host.error_counter import ErrorCounter
 from dreamfleet.coordinator.addons.dashboard.live_runs import DashboardSnapshot, Watcher
 
-REFRESH = 1.0  # seconds
+REFRESH = 1.0  # seconds; main.js reckons with it
 LINGER = 5.0  # seconds of polling after the last viewer left: the page may just be reloading
 MOST_VIEWERS = 500
 log = logging.getLogger(__name__)

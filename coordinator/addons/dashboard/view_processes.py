@@ -20,10 +20,10 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.processes import VerbProcess
 from dreamfleet.common.printable import truncate
 from dreamfleet.common.protocol import keys
+from dreamfleet.coordinator.addons.dashboard.feed import LINGER
 from dreamfleet.coordinator.addons.web.documents import event
 
 RATE = 10  # pictures a second
-LINGER = 5.0  # seconds until a view without viewers ends: the page may just be reloading
 CHECK_INTERVAL = 0.5  # seconds between checks for viewers
 STALLED = 15.0  # seconds after which a viewer that takes nothing no longer counts
 TIMEOUT = 3.0  # seconds for a process to exit after its stream ended

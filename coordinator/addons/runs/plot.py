@@ -15,7 +15,6 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.legend import Legend
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from dreamfleet.common.addons.analysis.drawn_values import describe_all_steps, effort_axes, goal_of
 from dreamfleet.common.addons.analysis.fitness_chart import (
     PLAIN,
     PLOT_COLOURS,
@@ -27,11 +26,12 @@ from dreamfleet.common.addons.analysis.fitness_chart import (
 )
 from dreamfleet.common.addons.analysis.learning import LearningCurve
 from dreamfleet.common.addons.analysis.run_archive import RunArchive, exploration_note
+from dreamfleet.common.addons.analysis.scored_history import effort_axes, goal_of, steps_text, value_axis
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import open_output
 from dreamfleet.common.host.add_ons import add_on
 from dreamfleet.common.printable import plural
-from dreamfleet.common.protocol.function_values import is_minimised, spans_decades
+from dreamfleet.common.protocol.function_values import spans_decades
 from dreamfleet.common.protocol.tasks import is_function_task
 from dreamfleet.common.runs.effort import Effort, format_steps
 from dreamfleet.common.runs.records import SUBMITTED
@@ -76,11 +76,12 @@ def fitness_figure(run: RunFolder) -> Figure:
     shares = [3, 2] if two else [1]
     panels = figure.subplots(len(shares), 1, sharex=True, squeeze=False, height_ratios=shares)[:, 0]
     handles = draw_fitness(list(panels), run)
-    steps = describe_all_steps(stages, settings.task, run.episode_limit)
+    steps = steps_text(stages, settings.task, run.episode_limit)
     evaluated = "; evaluated: whole episodes" if run.evaluations() and not two else ""
     limit = textwrap.wrap(f"in {steps} at most{evaluated}", LABEL)
     is_function = is_function_task(settings.task.task)
-    label = (_value_axis(run, panels[0]),) if is_function else ("fitness (sum of rewards)", *limit)
+    is_log = panels[0].get_yscale() == "log"
+    label = (value_axis(settings.task, is_log=is_log),) if is_function else ("fitness (sum of rewards)", *limit)
     panels[0].set_ylabel("\n".join(label))
     if two:
         panels[1].set_ylabel("score in reality\n(whole episodes)")
@@ -98,11 +99,6 @@ def _note(run: RunFolder) -> str:
     archive = RunArchive.of(run) if explores else None
     found = "" if archive is None else f"Archive: {archive.status.description}."
     return " ".join(filter(None, (f"{seeds}." if seeds and explores else seeds, explores, found)))
-
-
-def _value_axis(run: RunFolder, axes: Any) -> str:
-    goal = goal_of(minimised=is_minimised(run.spec))
-    return f"value of the function ({goal}{', log scale' if axes.get_yscale() == 'log' else ''})"
 
 
 def draw_runs(runs: Sequence[RunFolder], kind: str) -> Figure:

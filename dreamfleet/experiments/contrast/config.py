@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from dreamfleet.common.cli.key_values import split_flags
 from dreamfleet.common.cli.presets import default_run_preset
 from dreamfleet.common.errors import UsageError
-from dreamfleet.experiments.iteration.config import RESERVED_FLAGS
+from dreamfleet.experiments.iteration.config import MOST_SEED, RESERVED_FLAGS
 from dreamfleet.experiments.local.command_lines import Words
 
 # Equal parameters: 422,625 and 421,277 of 32 latents and three actions.
@@ -16,7 +16,6 @@ KINDS = (("plain", ""), ("attentive", "--set window=8 hidden=236"))
 SEEDS = (1, 2, 3)
 RUN_FLAGS = "--generations 32"
 _NAME = re.compile(r"[a-z][a-z0-9-]{0,30}")
-MOST_SEED = 2**31 - 1
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-EPISODES, ENCODED = "episodes", "encoded"
-BUNDLE, CONTROLLER = "bundle.zip", "controller.npz"  # as a run's folder has them
+from dreamfleet.common.runs.run_paths import BUNDLE, CONTROLLER
+
+EPISODES, ENCODED = "episodes", "encoded"  # ENCODED counts alike: worker/training/encode.py
 
 
 @dataclass(frozen=True)

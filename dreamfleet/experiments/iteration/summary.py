@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from dreamfleet.common.printable import plural
+from dreamfleet.common.printable import format_duration, plural
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.experiments.iteration.gate import KNOWS, LOSES, SURVIVES
 from dreamfleet.experiments.iteration.layout import IterationFolder
@@ -18,9 +18,8 @@ SHOWN = {  # figures of training, as `train` names them
 
 def format_entry(entry: FinishedPhase) -> str:
     """A finished phase: its round, what, how long, and what came out."""
-    seconds = entry.seconds
-    lasted = f"{seconds:.0f} s" if seconds < 600 else f"{seconds / 60:.0f} min"
-    return f"round {entry.round}  {entry.phase:<7} {lasted:>8}  {describe_outcome(entry)}".rstrip()
+    lasted = format_duration(entry.seconds)
+    return f"round {entry.round}  {entry.phase:<7} {lasted:>10}  {describe_outcome(entry)}".rstrip()
 
 
 def describe_outcome(entry: FinishedPhase) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 Words = tuple[str, ...]
+MOST_WORKERS = 1024  # processes of one slot
 
 
 def command(*parts: object) -> Words:

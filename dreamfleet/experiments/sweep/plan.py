@@ -12,13 +12,13 @@ from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.keys import check_run_name
-from dreamfleet.experiments.local.command_lines import Words
+from dreamfleet.experiments.local.command_lines import MOST_WORKERS, Words
 
 MOST_RUNS = 1000  # of one sweep
 _RANGE = re.compile(r"(-?\d+)\.\.(-?\d+)")
 _DASHED = re.compile(r"(0|[1-9]\d*)-([1-9]\d*)")
 SEED = "seed"  # runs that differ in it alone are one setting's repetitions
-PARALLEL, MOST_PARALLEL, MOST_WORKERS = 4, 64, 1024
+PARALLEL, MOST_PARALLEL = 4, 64
 Vary = dict[str, tuple[str, ...]]  # flag of `coordinator` without `--` -> its values
 
 

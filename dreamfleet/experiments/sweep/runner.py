@@ -17,8 +17,11 @@ from dreamfleet.common.errors import DreamfleetError, StoppedError
 from dreamfleet.common.host.child import END_TIMEOUT
 from dreamfleet.common.host.processes import VerbProcess, shell_command
 from dreamfleet.common.host.stop_signals import Stop, signals_deferred
+from dreamfleet.common.protocol.function_values import value_of
+from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.common.runs.run_folder import open_run
+from dreamfleet.common.schema.validation import from_plain_lenient
 from dreamfleet.common.transport.network import Network
 from dreamfleet.coordinator.addons.environment_check import CHECKED
 from dreamfleet.coordinator.run.shown_state import WAITS_FOR_WORKERS
@@ -180,9 +183,9 @@ class SweepRunner:
             if status is None or each.run.name not in self._coordinators:
                 continue
             barred = self._describe_barred(each.run.name, status)
-            each.text = barred or _describe(status)
+            each.text = barred or describe(status)
             if not barred and (status.get("state") != "paused" or status.get("pauses") == [PauseKind.BY_HAND]):
-                each.paused_since = None
+                each.paused_since = None  # decided as in `StartedRun._check_pause`
             elif each.paused_since is None:
                 each.paused_since = self._looked_at
             elif self._looked_at - each.paused_since > PAUSE_TIMEOUT:
@@ -247,11 +250,13 @@ class SweepRunner:
                 each.end()
 
 
-def _describe(status: Mapping[str, Any]) -> str:
-    with suppress(KeyError, TypeError, ValueError):  # a coordinator of another version
+def describe(status: Mapping[str, Any]) -> str:
+    """A run's progress in a few words; empty for a status of another version."""
+    with suppress(DreamfleetError, KeyError, TypeError, ValueError):
         closed, limit = int(status["generations"]), int(status["limits"].get("generations") or 0)
         state = "" if status["state"] == "running" else f"{status['state']}, "
+        task = from_plain_lenient(TaskSpec, status["settings"]["task"])
         judged = status.get("confirmed") or status.get("best")
-        score = "" if judged is None else f", evaluated {float(judged['mean']):z.4g}"
+        score = "" if judged is None else f", evaluated {value_of(float(judged['mean']), task):z.4g}"
         return f"{state}generation {closed}{f' of {limit}' if limit else ''}{score}"
     return ""

@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from dreamfleet.common.addons.analysis.drawn_values import goal_of
+from dreamfleet.common.addons.analysis.scored_history import goal_of
 from dreamfleet.common.protocol.function_values import fitness_word, is_minimised, value_of
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.run_folder import RunFolder, open_run

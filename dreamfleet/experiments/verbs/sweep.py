@@ -44,7 +44,6 @@ FIRST = (
 )
 SETTINGS_OF_RUNS = ("beat", "evaluation_share", "failure_limit", "share", "strict")  # of `NetworkConfig`
 ENDPOINTS = ("listen", "connect")
-LEFT_OPEN = 130
 # Flags of `coordinator` that a sweep sets for each run, or has for all of them.
 OWN = (
     "run", "resume", "from", "listen", "connect", "runs-dir", "json", "config", "join", "access-dir", "insecure",
@@ -246,7 +245,7 @@ def _report(args: argparse.Namespace, sweep: Sweep, folder: SweepFolder, progres
             print(f"{figure}: learning curves by setting")
     for each in (*failed, *left):
         print(f"run {each.run.name} {each.state}: {each.text}", file=sys.stderr)
-    return 1 if failed else LEFT_OPEN if left else 0
+    return 1 if failed else StoppedError.exit_code if left else 0
 
 
 def print_settings(results: list[RunResult]) -> None:

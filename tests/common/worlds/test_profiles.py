@@ -22,7 +22,7 @@ from dreamfleet.common.worlds.score_words import profile_of, score_word_of_run
 from dreamfleet.common.worlds.shipped import WORLDS
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
-from dreamfleet.worker.addons.evaluation.known_score import KnownScore, find_known_score, first_seed
+from dreamfleet.worker.addons.evaluation.known_score import KnownScore, find_known_score, first_seed, median_drive
 from dreamfleet.worker.tasks.registry import find_world
 from dreamfleet.worker.training.presets import PRESETS
 from tests.support.bundles import write_world_bundle
@@ -64,9 +64,8 @@ def test_the_scores_of_shipped_controllers_are_those_of_the_reports():
     known = {}
     for path in RESULTS.glob("*.json"):
         report = read_evaluation_report(path)
-        drives = sorted(report.drives, key=lambda each: (each.score, each.seed))
-        middle = drives[(len(drives) - 1) // 2].seed
-        found = report.results
+        drives, found = {each.seed: each.score for each in report.drives}, report.results
+        middle, _ = median_drive(drives)
         known[report.world, report.controller[:12]] = round(found.mean, 1), round(found.error, 1), len(drives), middle
     shipped = {
         (world.task, each.sha256): (each.mean, each.error, each.episodes, each.median_seed)

@@ -10,12 +10,15 @@ from dataclasses import replace
 
 import pytest
 
+from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.cli.global_config import complete_arguments
 from dreamfleet.common.errors import DreamfleetError, UsageError
 from dreamfleet.common.host.trusted_modules import VARIABLE
+from dreamfleet.common.protocol.messages import TaskSpec
+from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.experiments.local.local_run import task_flags
-from dreamfleet.experiments.sweep import summary
+from dreamfleet.experiments.sweep import runner, summary
 from dreamfleet.experiments.sweep.figure import sweep_figure
 from dreamfleet.experiments.sweep.folder import SETTINGS, StoredSweep, SweepFolder
 from dreamfleet.experiments.sweep.plan import MOST_RUNS, Sweep, SweepOptions, parse_vary, read_vary
@@ -37,6 +40,16 @@ def folder(tmp_path):
 
 def sweep_of(*vary, flags=FLAGS, name="carts"):
     return Sweep(name, parse_vary(vary), flags)
+
+
+def test_progress_of_a_minimised_function_has_its_value():
+    options = Objective.of({"dimension": 2, "x0": 0, "minimise": True}).options
+    task = to_plain(TaskSpec("function:mine:cost", "", 1, 0, options=options))
+    status = {"state": "running", "generations": 2, "limits": {}, "best": {"mean": -0.25}, "settings": {"task": task}}
+    assert re.findall(r"-?0\.25", runner.describe(status)) == ["0.25"]
+    status["settings"]["task"] = to_plain(TaskSpec("gym:CartPole-v1", "", 9, 0))
+    assert re.findall(r"-?0\.25", runner.describe(status)) == ["-0.25"]
+    assert runner.describe({}) == ""
 
 
 def test_a_grid_has_every_combination_and_repeats_all_settings_before_the_next_seed():

@@ -13,11 +13,11 @@ from dreamfleet.common.host.stop_signals import Stop, never_stop
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.runs.episode_results import EpisodeResult
 from dreamfleet.worker.addons.card import card_page
-from dreamfleet.worker.addons.evaluation.agents import Agent, make_agent, make_evaluation_spec
+from dreamfleet.worker.addons.evaluation.agents import make_agent, make_evaluation_spec
 from dreamfleet.worker.addons.evaluation.evaluation import facts_of
 from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport, differing_facts
-from dreamfleet.worker.addons.evaluation.known_score import first_seed
-from dreamfleet.worker.addons.recording.verb import MOST_STEPS
+from dreamfleet.worker.addons.evaluation.known_score import KnownScore, first_seed, median_drive
+from dreamfleet.worker.addons.recording.verb import is_cut
 from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.registry import find_scored_task, task_of
 
@@ -102,18 +102,17 @@ def _film(contents: card_page.CardContents, path: Path, steps: int, on_step: Cal
     from dreamfleet.worker.addons.recording.recording import record, record_in_process  # PyAV
 
     agent = make_agent(contents.controller, contents.bundle)
-    seed, most = _seed_to_film(contents.report, agent), min(steps, agent.world.horizon)
+    seed, most = seed_to_film(contents.report, agent.known_score), min(steps, agent.world.horizon)
     film = partial(record, agent, steps=most)
     score, driven = record_in_process(film, seed, path, on_step, stop)
     if stop():
         raise StoppedError(f"stopped: {path.parent} is no whole card; delete it, and the same command writes it anew")
     contents.filmed = EpisodeResult(seed, score, driven)
-    contents.is_cut = driven == most < min(agent.world.horizon, MOST_STEPS)
+    contents.is_cut = is_cut(driven, most, agent.world.horizon)
 
 
-def _seed_to_film(report: EvaluationReport | None, agent: Agent) -> int:
+def seed_to_film(report: EvaluationReport | None, known: KnownScore | None) -> int:
     """The seed of the report's median drive; without a report, of the median that is known of it."""
     if report is None:
-        return first_seed(agent.known_score)
-    ordered = sorted(report.drives, key=lambda each: each.score)
-    return ordered[len(ordered) // 2].seed
+        return first_seed(known)
+    return median_drive({each.seed: each.score for each in report.drives})[0]

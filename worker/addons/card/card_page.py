@@ -13,6 +13,7 @@ from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.printable import one_line, plural
 from dreamfleet.common.protocol.tasks import GYM
 from dreamfleet.common.runs.episode_results import EpisodeResult
+from dreamfleet.common.runs.seeds import TEST
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.score_words import profile_of, score_word
 from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
@@ -136,7 +137,7 @@ def _describe_video(contents: CardContents) -> str:
 
 
 def _describe_script(contents: CardContents) -> Iterator[str]:
-    seeds = [10000, 10001] if contents.report is None else list(contents.report.results.seeds[:2])
+    seeds = (TEST if contents.report is None else contents.report.results.seeds)[:2]
     yield from ("Without dreamfleet:", "", "```sh", contents.install)
     yield from (f"python {SCRIPT} {' '.join(map(str, seeds))}", "```", "")
     if contents.difference == 0:

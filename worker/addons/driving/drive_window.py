@@ -12,10 +12,10 @@ import pygame
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import NoDisplayError
+from dreamfleet.worker.addons.recording.canvas import BACKGROUND, FAINT, INK
 
 FRAMES_PER_SECOND = 50  # CarRacing's
 BAR_HEIGHT, MIN_WIDTH = 64, 640  # pixels that the text needs
-BACKGROUND, INK, FAINT = (18, 20, 24), (235, 235, 235), (150, 155, 165)
 INVISIBLE = ("offscreen", "dummy")  # SDL's drivers without a screen
 QUIT_KEYS = (pygame.K_ESCAPE, pygame.K_q)
 LEFT, RIGHT = (pygame.K_LEFT, pygame.K_a), (pygame.K_RIGHT, pygame.K_d)

@@ -7,9 +7,10 @@ import pygame
 from numpy.typing import NDArray
 
 from dreamfleet.common.printable import printable
-from dreamfleet.worker.addons.driving.drive_window import BACKGROUND, FAINT, QUIT_KEYS, open_display
+from dreamfleet.worker.addons.driving.drive_window import QUIT_KEYS, open_display
+from dreamfleet.worker.addons.recording.canvas import BACKGROUND, FAINT
 
-INITIAL_SIZE = 720, 680  # pixels, until there is a picture
+INITIAL_SIZE = 720, 680  # pixels, until there is a picture: those of live_view.py
 REMEDY = "write a file by --out live.mp4, look where there is a screen, or through `ssh -X`"
 
 

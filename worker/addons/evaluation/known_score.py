@@ -4,6 +4,7 @@ Pages: watch.md, own-environment.md.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,6 +41,11 @@ class KnownScore:
         if seed == self.median_seed:
             return f", the median of {episodes}, whose mean is {mean}"
         return f"; the controller's mean over {episodes}: {mean}"
+
+
+def median_drive(drives: Mapping[int, float]) -> tuple[int, float]:
+    """The seed and score of the middle drive, neither the best nor a crash; of an even number the lower one."""
+    return sorted(drives.items(), key=lambda drive: (drive[1], drive[0]))[(len(drives) - 1) // 2]
 
 
 def first_seed(known: KnownScore | None) -> int:

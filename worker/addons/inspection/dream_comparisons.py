@@ -35,7 +35,7 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 FOLDS = 10  # many, because linear probes are fast to fit and steps off the road are rare
 MAX_DRIVES = 10  # most drives per wanted loss
-CALM = "no loss"  # name of the beginnings after which reality stays on the road
+CALM = "no loss"  # as iteration/gate.py knows it: name of the beginnings after which reality stays on the road
 BEGUN = {"0 steps before": "at the loss", CALM: "where nothing is lost"}  # clearer words for some beginnings
 WHERE = {
     "reality": "reality",

@@ -12,7 +12,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.printable import plural, truncate
 from dreamfleet.common.protocol.keys import host_of
 from dreamfleet.common.worlds.score_words import profile_of
-from dreamfleet.worker.addons.recording.canvas import BACKGROUND, FAINT, Board, Frame, pixels
+from dreamfleet.worker.addons.recording.canvas import BACKGROUND, FAINT, Board, Frame, pixels, size_within
 from dreamfleet.worker.addons.recording.parallel_dream import DreamContinuation
 from dreamfleet.worker.tasks.api import Actions
 from dreamfleet.worker.worldmodel.inference import Decoder
@@ -140,9 +140,7 @@ class LiveCanvas(Board):
 
     def _draw_fitted(self, label: str, picture: Frame, corner: Corner, room: tuple[int, int]) -> None:
         """Draw a picture as large as `room` allows, below its label."""
-        height, width = picture.shape[:2]
-        scale = min(room[0] / width, room[1] / height)
         self._captions.append(label)
         self._text(label, corner, self._small, FAINT)
-        size = max(1, round(width * scale)), max(1, round(height * scale))
-        self._picture(picture, (corner[0], corner[1] + LABEL), size, smooth=height != width)
+        place, (height, width) = (corner[0], corner[1] + LABEL), picture.shape[:2]
+        self._picture(picture, place, size_within(room, picture), smooth=height != width)

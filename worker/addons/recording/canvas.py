@@ -96,11 +96,9 @@ class Board:
 
     def _fitted(self, picture: Frame, corner: Corner, room: tuple[int, int]) -> None:
         """Draw a picture as large as `room` allows, in its middle; pixels stay visible where they are few."""
-        height, width = picture.shape[:2]
-        scale = min(room[0] / width, room[1] / height)
-        size = max(1, round(width * scale)), max(1, round(height * scale))
+        size = size_within(room, picture)
         place = corner[0] + (room[0] - size[0]) // 2, corner[1] + (room[1] - size[1]) // 2
-        self._picture(picture, place, size, smooth=min(height, width) >= FEWEST_SMOOTHED)
+        self._picture(picture, place, size, smooth=min(picture.shape[:2]) >= FEWEST_SMOOTHED)
 
     def _picture(self, picture: Frame, corner: Corner, size: tuple[int, int], *, smooth: bool = False) -> None:
         """Draw a picture at `size`: smoothed, or with visible pixels."""
@@ -209,3 +207,10 @@ def pixels(surface: pygame.Surface) -> Frame:
     """A surface as an array `(height, width, 3)`; ten times faster than transposing pygame's own array."""
     width, height = surface.get_size()
     return np.frombuffer(pygame.image.tobytes(surface, "RGB"), np.uint8).reshape(height, width, 3)
+
+
+def size_within(room: tuple[int, int], picture: Frame) -> tuple[int, int]:
+    """Width and height of a picture that is drawn as large as `room` allows, in its proportions."""
+    height, width = picture.shape[:2]
+    scale = min(room[0] / width, room[1] / height)
+    return max(1, round(width * scale)), max(1, round(height * scale))

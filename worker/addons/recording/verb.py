@@ -83,6 +83,11 @@ def video_paths(args: argparse.Namespace, default_seed: int) -> dict[int, Path]:
     return videos
 
 
+def is_cut(driven: int, most: int, horizon: int) -> bool:
+    """Whether a video of `most` steps at most ends before its drive, since fewer were asked for than one has."""
+    return driven == most < min(horizon, MOST_STEPS)
+
+
 def _record_videos(args: argparse.Namespace, agent: Agent, record_here: Recorder) -> None:
     """Record one video after another and print each score; Ctrl-C ends the current video and the verb."""
     from dreamfleet.worker.addons.recording.recording import record_in_process
@@ -102,7 +107,7 @@ def _record_videos(args: argparse.Namespace, agent: Agent, record_here: Recorder
                     f"{profile.format_score(score)}; the same command records whole episodes"
                 )
             beside = "" if known is None else known.describe_beside(seed, word)
-            if driven == most < min(world.horizon, MOST_STEPS):  # scores of whole episodes are no measure for it
+            if is_cut(driven, most, world.horizon):  # scores of whole episodes are no measure for it
                 beside = f" in its first {plural(driven, 'step')} (--steps)"
             where = f"{video} (in place of an earlier one)" if replaces else f"{video}"
             text = f"{where}: {profile.format_score(score)} on {word} {seed}{beside}"

@@ -62,7 +62,7 @@ export const number = (value, digits = 1) =>
     : value.toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits });
 
 // A score: with one decimal, so that a column of them is aligned, or in three significant digits if it is small. One that
-// is tiny or huge has an exponent, as in `format_number`.
+// is tiny or huge has an exponent, as in common/printable.py.
 export const score = (value) => {
   const size = Math.abs(value ?? 0);
   if (size && (size < 1e-4 || size >= 1e12)) return String(Number(value.toPrecision(4)).toExponential()).replace(/e([+-])(\d)$/, "e$10$2");

@@ -4,7 +4,7 @@ import * as charts from "./charts.js";
 import { ask, clock, colour, facts, fill, make, number, open, runLink, say, score, tiles } from "./dom.js";
 import * as view from "./view.js";
 
-const TONES = {
+const TONES = { // by the words of run/shown_state.py
   running: "good", evaluating: "busy", paused: "bad", "waiting for workers": "wait", "waiting for a batch": "wait", "coordinator lost": "bad",
   ended: "done", "left open": "wait", "no coordinator": "wait",
 };
@@ -156,7 +156,7 @@ const fillPopulation = ({ candidates, evaluation }) => {
   const { generation, total, done, wanted, fitness, word, minimised } = candidates;
   const known = fitness.filter((each) => each !== null);
   const [low, high] = [Math.min(...known), Math.max(...known)];
-  const failed = wanted.filter((each) => each === 0).length;
+  const failed = wanted.filter((each) => each === 0).length; // counts alike: common/client/status.py
   const finished = done.filter((each, index) => each >= wanted[index]).length - failed;
   const rest = total > done.length ? `, the first ${done.length} are shown` : "";
   const open = total > 0;
@@ -228,7 +228,7 @@ const fillWorkers = (frame) => {
 };
 
 const split = (worker) => {
-  const at = worker.lastIndexOf("/");
+  const at = worker.indexOf("/"); // counts alike: common/protocol/keys.py
   return at < 0 ? [worker, ""] : [worker.slice(0, at), worker.slice(at)];
 };
 

@@ -8,7 +8,7 @@ import * as live from "./live.js";
 import * as runs from "./runs.js";
 import * as view from "./view.js";
 
-const SILENCE = 4000; // milliseconds without a word after which the dashboard itself is missed
+const SILENCE = 4000; // four of feed.py's REFRESH, in milliseconds without a word after which the dashboard itself is missed
 const silent = document.getElementById("silent");
 const digest = new URL(import.meta.url).pathname.split("/").at(-2);
 

@@ -107,9 +107,9 @@ const describe = (each, key) => {
   return NUMBERS.has(key) ? score(each[key]) : (each[key] ?? "");
 };
 
-// As many decimals as show the first figure of a small error.
+// As many decimals as show the first figure of a small error. Counts alike: common/runs/standard_error.py.
 const withError = (mean, error) => {
-  if ((error > 0 && error < 1e-6) || Math.abs(mean) >= 1e12) return `${score(mean)} ± ${score(error)}`;
+  if (error < 1e-6 || Math.abs(mean) >= 1e12) return `${score(mean)} ± ${score(error)}`;
   const digits = error > 0 && error < 0.1 ? Math.min(6, -Math.floor(Math.log10(error))) : 1;
   return `${number(mean, digits)} ± ${number(error, digits)}`;
 };

@@ -3,7 +3,7 @@ A function that is minimised has its own values. What runs learnt from what they
 fitness as pictures; what differs between them.
 
 Tests plot.py, run_details.py, verb.py, analysis_verb.py, common/protocol/function_values.py, common/runs/effort.py,
-common/addons/analysis/comparison.py, common/addons/analysis/drawn_values.py,
+common/addons/analysis/comparison.py, common/addons/analysis/scored_history.py,
 common/addons/analysis/fitness_chart.py, common/addons/analysis/learning.py,
 coordinator/addons/dashboard/compared_runs.py, dreamfleet/experiments/verbs/compare.py and
 coordinator/addons/runs/citation.py.
@@ -29,9 +29,9 @@ from dreamfleet.common.addons.analysis.comparison import (
     differing_settings,
     differing_values,
 )
-from dreamfleet.common.addons.analysis.drawn_values import effort_axes
 from dreamfleet.common.addons.analysis.fitness_chart import WINDOW, running_median
 from dreamfleet.common.addons.analysis.learning import LearningCurve, Point
+from dreamfleet.common.addons.analysis.scored_history import effort_axes
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.client.equal_fitness import ENOUGH, EqualFitness

@@ -24,7 +24,7 @@ from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.printable import one_line
 from dreamfleet.common.runs.lookup import find_bundle_of
 from dreamfleet.common.runs.standard_error import format_with_error
-from dreamfleet.worker.addons.card.card import write_card
+from dreamfleet.worker.addons.card.card import seed_to_film, write_card
 from dreamfleet.worker.addons.card.card_page import CardContents, describe_card
 from dreamfleet.worker.addons.card.driver_graph import export_driver, largest_difference
 from dreamfleet.worker.addons.card.score_chart import draw_scores
@@ -79,6 +79,12 @@ def test_the_folder_holds_what_its_card_names(card):
     graph = onnx.load(card / "controller.onnx", load_external_data=False).graph
     assert [each.name for each in graph.input] == ["picture", "state"]
     assert not any(each.external_data for each in graph.initializer)
+
+
+def test_the_video_shows_the_same_median_drive_with_a_report_and_without():
+    report, known = read_evaluation_report(REPORT), find_known_score(find_controller("real"))
+    assert len(report.drives) % 2 == 0
+    assert seed_to_film(report, known) == seed_to_film(None, known) == known.median_seed
 
 
 def test_a_hub_reads_the_metadata(card):
