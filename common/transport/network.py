@@ -17,6 +17,7 @@ SECURED_ENDPOINT = "tls/0.0.0.0:7447"  # default of a secured coordinator, which
 SECURED_LOOPBACK = "tls/127.0.0.1:7447"
 LOOK_INTERVAL = 0.02  # seconds between two looks whether a process of this host listens
 _LOOPBACK_HEADER = re.compile(r"(localhost|127\.\d+\.\d+\.\d+|\[::1\])(:\d+)?", re.IGNORECASE)
+_ANY_ADDRESS = re.compile(r"/(0\.0\.0\.0|\[::\]):")  # all addresses of a host
 _ENDPOINT = re.compile(r"(tcp|tls|udp|quic)/(\[[0-9a-fA-F:]+(?:%[\w.-]+)?\]|[^:/\s%]+):(\d{1,5})")
 
 
@@ -62,6 +63,11 @@ def split_endpoint(endpoint: str) -> tuple[str, int]:
 def is_loopback(endpoint: str) -> bool:
     """Whether only this host can reach an endpoint."""
     return is_loopback_host(split_endpoint(endpoint)[0])
+
+
+def at_host(endpoint: str, host: str) -> str:
+    """An endpoint with `host` where it listens on all addresses of its own host, else as it is."""
+    return _ANY_ADDRESS.sub(lambda _: f"/{host}:", endpoint)
 
 
 def wait_for_listener(endpoints: Sequence[str], seconds: float, stopped: Callable[[], bool]) -> bool:

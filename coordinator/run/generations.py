@@ -156,7 +156,7 @@ class Generations:
         statistics = fitness_statistics(fitness)
         closed = StoredGeneration(
             number=generation.number, **statistics, sigma=self._strategy.sigma, steps=generation.steps,
-            seconds=seconds, failed=len(self.redrawn.union(generation.failed)),
+            seconds=seconds, failed=self.count_failed(generation),
         )  # fmt: skip
         self._strategy.tell(_ranked(fitness, statistics["worst"]), measures)
         self._journal.recalls.set_surplus_aside(generation.number, generation.surplus)
@@ -218,8 +218,12 @@ class Generations:
         """
         first = max(since, self.begun.since, generation.number - RECENT + 1)
         counted = range(first, generation.number + 1)
-        opened = len(self.redrawn.union(generation.failed)) if counted else 0
+        opened = self.count_failed(generation) if counted else 0
         return sum(each.failed for each in self.history.rows[first:]) + opened, counted
+
+    def count_failed(self, generation: Generation) -> int:
+        """The candidates of the open generation that failed, those that were drawn anew included."""
+        return len(self.redrawn.union(generation.failed))
 
     def find_scored(self, generation: Generation) -> ScoringJob | None:
         """A job of the open generation or the last one that has a score; `None` if there is none."""

@@ -19,13 +19,12 @@ from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.protocol.tasks import is_function_task, is_unregistered
 from dreamfleet.common.runs.records import StoredGeneration, count_episodes, format_mean, in_values, with_error
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, Credentials, describe_time_left
-from dreamfleet.common.transport.network import Network, is_loopback
+from dreamfleet.common.transport.network import Network, at_host, is_loopback
 from dreamfleet.coordinator.run.run import Run
 from dreamfleet.coordinator.run.shown_state import WAITS_FOR_WORKERS, shown_state
 from dreamfleet.coordinator.service.snapshot import Snapshot
 
 log = logging.getLogger(__name__)
-WILDCARD_HOSTS = ("0.0.0.0", "[::]")  # noqa: S104 - compared with addresses, never listened on
 SUMMARY_INTERVAL = 60.0  # seconds from one summary line to the next
 DAY = 86_400.0  # seconds from one warning that the join file expires to the next
 CLOCK_STEP = 5.0  # seconds by which a wall clock that is not set stays true
@@ -147,14 +146,7 @@ def worker_command(network: Network, run: str, task: str) -> str:
 
     With join files the worker's own names the addresses.
     """
-    addresses = [_public_endpoint(each) for each in network.listen or network.connect]
+    addresses = [at_host(each, socket.gethostname()) for each in network.listen or network.connect]
     where = ("--connect", *addresses) if network.credentials is None else ("--join", "FILE")
     own = ("--task", task) if is_unregistered(task) else ()
     return shlex.join(("dreamfleet", "worker", "--run", run, *where, *own))
-
-
-def _public_endpoint(endpoint: str) -> str:
-    """An endpoint as other hosts reach it: a wildcard address is replaced by this host's name."""
-    protocol, _, where = endpoint.partition("/")
-    host, _, port = where.rpartition(":")
-    return f"{protocol}/{socket.gethostname()}:{port}" if host in WILDCARD_HOSTS else endpoint

@@ -172,7 +172,7 @@ def _open_generation(run: Run) -> GenerationStatus:
         temperature=run.generation.spec.temperature,
         stage=_stage(run),
         axis_ratio=None if axis_ratio is None else round(axis_ratio, 3),
-        failed=len(run.generations.redrawn.union(run.generation.failed)),
+        failed=run.generations.count_failed(run.generation),
     )
 
 

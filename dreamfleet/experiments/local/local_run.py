@@ -6,7 +6,6 @@ Pages: platforms.md.
 from __future__ import annotations
 
 import argparse
-import re
 import socket
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -25,7 +24,7 @@ from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import Stop, signals_deferred
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import JOURNAL
-from dreamfleet.common.transport.network import Network, wait_for_listener
+from dreamfleet.common.transport.network import LOOPBACK, Network, at_host, wait_for_listener
 from dreamfleet.coordinator.settings import run_setup
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.limits import LimitsConfig
@@ -38,7 +37,6 @@ CONNECT_INTERVAL = 0.05  # seconds between two attempts to reach a coordinator t
 POLL_INTERVAL = 0.2  # seconds between two looks whether to stop
 START_SECONDS = 180.0  # a coordinator that ends earlier is seen at once; a busy host takes its time
 PORTS = range(20_000, 32_000)
-ANY_ADDRESS = re.compile(r"/(0\.0\.0\.0|\[::\]):")  # an endpoint that listens on all of this host's addresses
 # Flags of `coordinator` that each run of an experiment has its own of, by the names of their values.
 RESERVED = {"run_name": "--run", "source": "--from"} | {
     name: f"--{name.replace('_', '-')}"
@@ -74,7 +72,7 @@ class LocalFleet:
     @property
     def local_endpoint(self) -> str:
         """Where this host's own workers connect to."""
-        return ANY_ADDRESS.sub("/127.0.0.1:", self.listen[0])
+        return at_host(self.listen[0], LOOPBACK)
 
 
 class LocalRun:

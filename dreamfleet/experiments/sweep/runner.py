@@ -22,7 +22,7 @@ from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.stop_kind import PauseKind
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.schema.validation import from_plain_lenient
-from dreamfleet.common.transport.network import Network
+from dreamfleet.common.transport.network import LOOPBACK, Network, at_host
 from dreamfleet.coordinator.addons.environment_check import CHECKED
 from dreamfleet.coordinator.run.shown_state import WAITS_FOR_WORKERS
 from dreamfleet.experiments.local import local_run
@@ -59,7 +59,7 @@ class SweepFleet:
     @property
     def local_endpoint(self) -> str:
         """Where this host's own processes connect to."""
-        return local_run.ANY_ADDRESS.sub("/127.0.0.1:", self.endpoint)
+        return at_host(self.endpoint, LOOPBACK)
 
 
 @dataclass
