@@ -29,6 +29,7 @@ LONG_FILE = 400
 PAGE = r"\bdocs/[\w/-]+\.md\b"  # as code names it
 FEW = 4  # verbs that reach a file, pages that name a flag: as many are listed
 MANY = 4  # words of a text that a page would not have by chance
+CALLS = r"""(?:[\[(]|dreamfleet["'],?|yield)\s*"""  # before the verb that code calls
 GENERIC = ("run", "configure", "load", "option")  # functions of many files
 # The worlds that ship: what names each of them, and its rooms, the files and folders in which that may stand.
 WORLDS = {
@@ -305,7 +306,7 @@ def about(path: Path) -> dict[str, list[str]]:
     module, text, room = f"dreamfleet.{module_of(path)}", (ROOT / path).read_text(), path.parent / "__init__.py"
     imported = {each: set(imports_of(each)) for each in sources(*SIDES, "tests")}
     users = [each for each, names in imported.items() if any(is_in(f"dreamfleet.{name}", module) for name in names)]
-    file = str(path) if len(list(ROOT.glob(f"*/**/{path.name}"))) > 1 else path.name
+    file = str(path) if sum(each.name == path.name for each in imported) > 1 else path.name
     public = [each.name for each in ast.parse(text).body if isinstance(each, (ast.ClassDef, ast.FunctionDef))]
     named = rf"\b({re.escape(file)}|{re.escape(module)})\b"
     groups = dict(CONFIG["project"]["entry-points"])
@@ -315,21 +316,22 @@ def about(path: Path) -> dict[str, list[str]]:
     near = sorted(verb for verb, of in verbs.items() if of in reached)
     own_verbs = [verb.split() for verb, of in verbs.items() if of == module]
     between = r"""["', ]+"""
-    calls = [rf"""(\(|dreamfleet["'],?)\s*["']{between.join(verb)}["']""" for verb in own_verbs]
+    calls = [rf"""{CALLS}["']{between.join(verb)}["']""" for verb in own_verbs]
     written = [f"dreamfleet {' '.join(verb)}\\b" for verb in own_verbs]
     codes = [f"`{each}\\b" for each in public if not each.startswith("_") and each not in GENERIC]
     worlds = [
         f"(?i:{name.pattern})" for name, rooms in WORLDS.items() if any(path.is_relative_to(room) for room in rooms)
     ]
     rooms = [each / "__init__.py" for each in path.parents if (ROOT / each / "__init__.py").exists()]
-    pages = set().union(*map(pages_of, (path, *rooms)))
+    around = set().union(*map(pages_of, rooms))
     in_code = re.compile("|".join([named, *calls, *written]))
-    in_pages = re.compile("|".join([named, *written, *codes, *worlds]))
+    in_pages = re.compile("|".join([named, *written, *codes]))
+    of_world = re.compile("|".join(worlds) or "(?!)")
     own = tests_of(path)
     naming = {each for each in sources("tests") if in_code.search((ROOT / each).read_text())}
     product = [each for each in users if each.parts[0] != "tests"]
     tests = [*own, *sorted({*users, *naming} - {*own, *product})]  # those of its own first
-    run = [rf"""(\(|dreamfleet["'],?)\s*["']{between.join(verb.split())}["']""" for verb in near]
+    run = [rf"""{CALLS}["']{between.join(verb.split())}["']""" for verb in near]
     by_verb = re.compile("|".join(run if len(run) <= FEW else ()) or "(?!)")
     running = {each for each in sources("tests") if by_verb.search((ROOT / each).read_text())}
     outside = [each for each in product if each.parent != path.parent]
@@ -346,12 +348,14 @@ def about(path: Path) -> dict[str, list[str]]:
         for name, value in of.items()
         if value.partition(":")[0] in reached
     ]
+    code = texts(*(f"{side}/**/*.{ending}" for side in SIDES for ending in ("py", "js", "c")))
     said = {" ".join(each.split()) for each in words_of(path) if len(each.split()) >= MANY}
     flat = {name: " ".join(page.split()) for name, page in documents.items()}
     quoted = {name for name, page in flat.items() if any(map(page.__contains__, said))}
     for flag in flags_of(text):
         found = {name for name, page in flat.items() if re.search(rf"(?<![\w-]){flag}(?![\w-])", page)}
         quoted |= found if len(found) <= FEW else set()
+    close = {name for name, page in documents.items() if name in {*pages_of(path), *quoted} or in_pages.search(page)}
     return {
         str(path): [ast.get_docstring(ast.parse(text)) or ""],
         str(path.parent): [ast.get_docstring(ast.parse((ROOT / room).read_text())) or "", listed, kind],
@@ -365,10 +369,13 @@ def about(path: Path) -> dict[str, list[str]]:
         "and those of its verbs": sorted(map(str, running - {*tests})) if len(near) <= FEW else ["too many verbs"],
         "reached by the entry points": points,
         "and by the verbs (docs/reference/verbs.md)": [", ".join(near) if len(near) <= 12 else "most of them"],
-        "named in": [
-            *(name for name, page in documents.items() if name in {*pages, *quoted} or in_pages.search(page)),
-            *(name for name, script in scripts.items() if in_code.search(script)),
-        ],
+        "named in the code of": sorted(
+            name for name, each in code.items() if re.search(named, each) and Path(name) not in {path, *users}
+        ),
+        "named in": [*sorted(close), *(name for name, script in scripts.items() if in_code.search(script))],
+        "and pages of its room or world": sorted(
+            name for name, page in documents.items() if name not in close and (name in around or of_world.search(page))
+        ),
     }
 
 

@@ -1,4 +1,4 @@
-"""The batches in a journal: what others submitted to a run without a search of its own. Pages: ask-tell.md."""
+"""The batches in a journal: what others submitted to a run without a search. Pages: ask-tell.md, protocol.md."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -77,7 +77,7 @@ class BatchRecords:
         return self._find("state = 'waiting' ORDER BY number LIMIT 1")
 
     def lines(self, most: int) -> list[BatchLine]:
-        """The open batches in their order, then finished ones, the last first."""
+        """The open batches in their order, then finished ones, the last first; so in openapi.py, batch_client.py."""
         query = "SELECT id, state, population, generation FROM batch WHERE state"
         found = [
             BatchLine(*row)

@@ -3,6 +3,7 @@
 A short episode uses everything that a fitness depends on: the simulator and its picture, the policy with its world
 model, and the batch of tasks such as the dream. All numbers on the way are hashed, not only the scores, because another
 rounding shows in the last bits of nearly any sum of products. It remains a sample: rarer differences are not found.
+Other inputs or other digits are another class of every host: a run goes on in its own (upgrade.md, tests of joining).
 A host whose second probe computes other bits than its first one has the class `NON_DETERMINISTIC`.
 """
 

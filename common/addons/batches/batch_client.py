@@ -58,7 +58,7 @@ class BatchClient:
         return self._query(run, "read", [(f"id={check_batch_id(batch_id)};offset={offset}", None)])[0]
 
     def list_batches(self, run: str) -> tuple[BatchLine, ...]:
-        """The open batches in their order, then finished ones, the last first; 512 at most."""
+        """The open batches in their order, then finished ones, the last first; 512 at most (batch_records.py)."""
         return self._query(run, "list", [("", None)])[0].batches
 
     def cancel(self, run: str, batch_id: str) -> BatchReply:
