@@ -21,8 +21,13 @@ def check(count):
         raise UsageError(f"--population is {count} and should be 2 to {LIMIT}; omit --{name}; see `dreamfleet runs`")
     log.info("%d candidates were scored", count)
     raise BatchError("too large", f"a batch of {count} candidates is too large")
+    raise RefusedError("start another worker here", ("--task", f"see `--trust {count} --to data` and {count}:{LIMIT}"))
     return "SELECT what is there FROM all of them"
 '''
+KEPT = (
+    "--population", "{count}", "{LIMIT}", "--{name}", "`dreamfleet runs`", "%d", "'too large'", "('--task'",
+    "`--trust {count} --to data`", "{count}:{LIMIT}",
+)  # fmt: skip
 
 
 @pytest.mark.wording
@@ -35,8 +40,8 @@ def test_a_key_keeps_flags_numbers_values_and_names():
     assert "A docstring is no message." in code
     assert "no more than that here" in code
     assert "FROM all of them" in code
-    assert "candidates" not in code
-    for kept in ("--population", "{count}", "{LIMIT}", "--{name}", "`dreamfleet runs`", "%d", "'too large'"):
+    assert not [word for word in ("candidates", "start", "see ") if word in code]
+    for kept in KEPT:
         assert kept in code
 
 
