@@ -3,6 +3,8 @@
 Tests coordinator/addons/dashboard/view_processes.py.
 """
 
+import signal
+
 import psutil
 import pytest
 
@@ -69,7 +71,7 @@ def test_pictures_come_with_their_facts_while_somebody_sees_them(browser, proces
         (only,) = children(started)
         only.kill()
         for each in (page, other):
-            say(each, "was ended by signal 9")
+            say(each, f" {signal.SIGKILL.value}")
             each.click("[data-part=view-again]")
             each.wait_for_selector("[data-part=view-again][hidden]", state="attached")
             each.wait_for_selector(PICTURE)
@@ -116,13 +118,14 @@ def test_a_worker_a_mean_and_an_earlier_generations_are_chosen_and_what_is_gone_
         with tab(browser) as other:
             other.goto(started.address)
             other.locator("[data-part=view]").scroll_into_view_if_needed()
-            say(other, "1 live views")
+            other.wait_for_selector("[data-part=view-again]:not([hidden])")
+            say(other, "1 ")
         page.wait_for_selector(f"{WHOM} option[value^=generation]", state="attached")
         run.worker.popen.kill()
-        say(page, "has left run test")
+        say(page, "--worker")
         choose(page, "generation")
-        say(page, "draws no pictures")
+        say(page, tasks.PAINTED)
         run.popen.kill()
         say(page, "lost", "state")
         page.select_option(WHOM, "best=")
-        say(page, "no one answers")
+        say(page, processes.endpoint)
