@@ -204,7 +204,7 @@ class RemoteHost:
             return
         if found.noexec:
             raise DreamfleetError(
-                f"{found.root} is on a file system that is mounted noexec, and no environment runs from there: name "
+                f"{found.root} is on a file system that is mounted `noexec`, and no environment runs from there: name "
                 "another --remote-dir"
             )
         if name in found.environments:
