@@ -17,7 +17,7 @@ from importlib.machinery import all_suffixes
 from importlib.util import cache_from_source
 from pathlib import Path
 
-from dreamfleet.common.files.regular_files import read_text
+from dreamfleet.common.files.regular_files import others_write, read_text
 from dreamfleet.common.host.trusted_modules import module_folder, module_places, search_in, trust
 from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.runs.own_runs import own_runs_dir
@@ -109,8 +109,3 @@ def _is_mine(path: Path, *, sticky: bool) -> bool:
     found = path.lstat()
     shared = others_write(found) and not (sticky and found.st_mode & stat.S_ISVTX)
     return found.st_uid in (os.geteuid(), 0) and (stat.S_ISLNK(found.st_mode) or not shared)
-
-
-def others_write(found: os.stat_result) -> bool:
-    """Whether others may write there. A group is the user's alone if it has the user's number; spawn's agent.py too."""
-    return bool(found.st_mode & (stat.S_IWOTH | (0 if found.st_gid == os.geteuid() else stat.S_IWGRP)))

@@ -1,4 +1,4 @@
-"""Opening untrusted paths: only regular files, up to a maximum size."""
+"""Opening untrusted paths: only regular files, up to a maximum size; and whether others may change them."""
 
 import errno
 import os
@@ -118,3 +118,8 @@ def _check_regular_size(found: os.stat_result, max_bytes: int) -> None:
         raise OSError(errno.EINVAL, "it is not a regular file")
     if found.st_size > max_bytes:
         raise OSError(errno.EFBIG, f"it is larger than {max_bytes} bytes")
+
+
+def others_write(found: os.stat_result) -> bool:
+    """Whether others may write there. A group is the user's alone if it has the user's number; spawn's agent.py too."""
+    return bool(found.st_mode & (stat.S_IWOTH | (0 if found.st_gid == os.geteuid() else stat.S_IWGRP)))

@@ -28,11 +28,10 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric.ec import SECP256R1, EllipticCurvePrivateKey, generate_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from dreamfleet.common.addons.own_modules import others_write
 from dreamfleet.common.errors import AccessError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write, check_output_path, reporting_write_errors
 from dreamfleet.common.files.locks import open_lock, wait_for_lock
-from dreamfleet.common.files.regular_files import read_regular, read_text
+from dreamfleet.common.files.regular_files import others_write, read_regular, read_text
 from dreamfleet.common.protocol.keys import check_worker_name
 from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, MAX_BYTES, CertificateLedger, IssuedJoinFile
 from dreamfleet.common.security.credentials import SEATS, Credentials, derive_password, format_join_file, hash_authority

@@ -9,7 +9,6 @@ from dreamfleet.common.cli.key_values import split_flags
 from dreamfleet.common.cli.presets import NAMES, check_preset, default_training_preset
 from dreamfleet.common.errors import UsageError
 from dreamfleet.experiments.local.command_lines import Words
-from dreamfleet.worker.addons.inspection.measure import FEWEST_DRIVES, FEWEST_LOSSES
 
 # They change no round that is finished, nor what it means; what `--run-flags` lead to is compared instead of them.
 CHANGEABLE = frozenset({"rounds", "local", "jobs", "device", "run_flags"})
@@ -94,9 +93,8 @@ class IterateConfig:
             raise UsageError(f"--noise must be from 0 to 10, not {self.noise}")
         if not 0 <= self.spells <= 1:
             raise UsageError(f"--spells must be from 0 to 1, not {self.spells}")
-        if 0 < self.gate_drives < FEWEST_DRIVES or 0 < self.gate_losses < FEWEST_LOSSES:
-            fewest = f"--gate-drives must be 0 or at least {FEWEST_DRIVES}, --gate-losses 0 or at least {FEWEST_LOSSES}"
-            raise UsageError(fewest)
+        if self.gate_drives == 1 or 0 < self.gate_losses < 4:  # as worker/addons/inspection/measure.py
+            raise UsageError("--gate-drives must be 0 or at least 2, --gate-losses 0 or at least 4")
         if self.subspace and not self.go_on:
             raise UsageError("--subspace changes an existing controller: give --go-on too")
         if self.views and not self.subspace:

@@ -25,7 +25,7 @@ OnFigure: TypeAlias = "Callable[[FigureName, FigureReport], None]"
 DRIVES, LOSSES, LIVES = 20, 30, 40
 UNITS = {"survival": (LIVES, "episodes"), "probe": (DRIVES, "drives"), "likeness": (DRIVES, "drives"),
          "losses": (LOSSES, "losses")}  # fmt: skip
-FEWEST_DRIVES, FEWEST_LOSSES = 2, 4
+FEWEST_DRIVES, FEWEST_LOSSES = 2, 4  # also in experiments/iteration/config.py, which imports no journal
 
 
 @dataclass(frozen=True)
