@@ -144,7 +144,7 @@ class HostFolder:
                 found = path.stat()
                 if not {link.st_uid, found.st_uid} <= {os.geteuid(), 0}:
                     raise FailedError(f"{path} is another user's: name another --remote-dir")
-                # Counts alike: common/addons/own_modules.py.
+                # Counts alike: common/files/regular_files.py.
                 by_group = bool(found.st_mode & stat.S_IWGRP) and found.st_gid != os.geteuid()
                 if by_group or found.st_mode & stat.S_IWOTH:
                     raise FailedError(
