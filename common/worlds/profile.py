@@ -1,4 +1,4 @@
-"""What a world that ships tells every host: its presets, published scores, demonstration. Pages: measurements.md."""
+"""What every host knows of a world that ships: its presets, published scores, demonstration. Pages: measurements.md."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
