@@ -29,7 +29,7 @@ def open_socket(where: WebAddress) -> socket.socket:
     host, port = where.host, where.port
     try:
         family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        made = socket.socket(family, kind)
+        made = socket.socket(family, kind, socket.IPPROTO_TCP)  # named, so that asyncio sends small answers at once
     except OSError as error:
         raise ConnectionFailedError(f"cannot listen on {host}: {error.strerror or error}") from error
     try:

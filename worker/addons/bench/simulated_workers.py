@@ -78,8 +78,8 @@ class SimulatedWorker:
             numbering=self.backlog.numbering, seen=self.backlog.seen, capacity=self.slots, slots=self.slots,
             queued=tuple(digest[:TAG_BYTES] for digest in self.backlog.queued),
             running=tuple(RunningJob(result.digest[:TAG_BYTES], 0) for _, result in self.running),
-            unacked=tuple(digest[:TAG_BYTES] for digest in self.outbox.digests), load=0.0, steps_per_second=0.0,
-            drawn_by="-",
+            unacked=tuple(digest[:TAG_BYTES] for digest in self.outbox.digests[:MAX_LEASES]),
+            load=0.0, steps_per_second=0.0, drawn_by="-",
         )  # fmt: skip
 
 

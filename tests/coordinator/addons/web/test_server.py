@@ -116,3 +116,9 @@ def test_endless_responses_give_way_only_where_nothing_is_idle(serving):
 def test_a_server_leaves_room_below_the_usual_limit_of_open_files():
     assert server.MOST_CONNECTIONS + 2 * server.BACKLOG < 1024 - 100
     assert resource.getrlimit(resource.RLIMIT_NOFILE)[1] >= 1024
+
+
+def test_no_connection_waits_for_more_to_send(serving):
+    serving.client(ENDLESS)
+    [connection] = serving.state.connections
+    assert connection.transport.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)

@@ -1,6 +1,7 @@
 """The lower bounds of `lab bench policy` and `lab bench dream` ignore slow libraries and inherited settings.
 Its peers may do what they like. Tests dispatch.py, measurement.py, simulated_workers.py, sleep_tasks.py and verb.py."""
 
+import hashlib
 import os
 import time
 from contextlib import contextmanager
@@ -10,12 +11,17 @@ import pytest
 
 from dreamfleet.common.host.resource_limits import POOLS
 from dreamfleet.common.host.trusted_modules import trust
+from dreamfleet.common.protocol.codec import decode, encode
+from dreamfleet.common.protocol.messages import MAX_LEASES, TAG_BYTES, Heartbeat, Intervals, Result
 from dreamfleet.worker.addons.bench import dispatch
 from dreamfleet.worker.addons.bench.matrix_products import LIBRARIES, fastest, product_cases, product_graph
+from dreamfleet.worker.addons.bench.simulated_workers import SimulatedWorker
 from dreamfleet.worker.addons.bench.sleep_tasks import HALF_SECOND_TASK, NULL_TASK, SLEEP_TASK
 from dreamfleet.worker.addons.bench.verb import measure_on_one_thread
+from dreamfleet.worker.service.admission import Admission
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worldmodel.inference import open_graph
+from tests.support.samples import NONCE, SPEC, UID
 
 
 def inherited(_bundle):
@@ -86,3 +92,13 @@ def test_a_peer_that_hangs_or_fails_has_no_figures(monkeypatch):
 def test_a_worker_finds_its_tasks_by_name(name):
     trust([name.partition(":")[0]])
     assert find_task(name).name == name
+
+
+def test_a_simulated_workers_heartbeat_lists_what_a_real_ones_may():
+    admission = Admission("bench", UID, 3, NONCE, SPEC, Intervals(beat=1.0, repeat=1.0))
+    worker = SimulatedWorker("crowd-0", admission, slots=64, seconds=0.0)
+    digests = [hashlib.sha256(number.to_bytes(4, "big")).digest() for number in range(MAX_LEASES + 76)]
+    for digest in digests:
+        worker.outbox.add(Result(digest, 0.0, 1, 0.0, None, None))
+    heard = decode(Heartbeat, encode(worker.beat()))
+    assert heard.unacked == tuple(digest[:TAG_BYTES] for digest in digests[:MAX_LEASES])
