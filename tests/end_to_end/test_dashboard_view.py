@@ -37,6 +37,13 @@ def say(page, text, part="view-text"):
     wait_for_text(page, text, part)
 
 
+def wait_for_end(page, *values):
+    """Wait until the view offers to start again, and check that its text names `values`."""
+    page.wait_for_selector("[data-part=view-again]:not([hidden])")
+    text = page.inner_text("[data-part=view-text]")
+    assert all(value in text for value in values), text
+
+
 def choose(page, kind):
     """The first of the workers, or of the generations, once there is one."""
     option = page.wait_for_selector(f"{WHOM} option[value^={kind}]", state="attached")
@@ -118,13 +125,13 @@ def test_a_worker_a_mean_and_an_earlier_generations_are_chosen_and_what_is_gone_
         with tab(browser) as other:
             other.goto(started.address)
             other.locator("[data-part=view]").scroll_into_view_if_needed()
-            say(other, "1 live views")
+            wait_for_end(other, "1")
         page.wait_for_selector(f"{WHOM} option[value^=generation]", state="attached")
         run.worker.popen.kill()
-        say(page, "has left run test")
+        wait_for_end(page, "alpha", "test")
         choose(page, "generation")
-        say(page, "draws no pictures")
+        wait_for_end(page)
         run.popen.kill()
         say(page, "lost", "state")
         page.select_option(WHOM, "best=")
-        say(page, "no one answers")
+        wait_for_end(page)
