@@ -3,6 +3,7 @@
 import base64
 import http.client
 import json
+from contextlib import ExitStack, closing
 from itertools import count, islice
 from typing import Any
 
@@ -26,15 +27,15 @@ def bench_batches() -> Figures:
     """
     with start_run(NULL_TASK, 64, EPISODES, external=True) as run, run.crowd(2, 32):
         run.coordinator.wait_for_report(ADDRESS)
-        with (
-            RemoteScorer(run.endpoint, "bench") as scorer,
-            VerbProcess("serve", "--connect", run.endpoint, "--port", 0) as bridge,
-        ):
+        with ExitStack() as stack:
+            scorer = stack.enter_context(RemoteScorer(run.endpoint, "bench"))
+            bridge = stack.enter_context(VerbProcess("serve", "--connect", run.endpoint, "--port", 0))
             address = bridge.wait_for_report(ADDRESS)
+            text, packed = (stack.enter_context(closing(HttpCaller(address, packed=each))) for each in (False, True))
             ways = {
                 "zenoh": lambda vectors, seeds: _score(scorer, vectors, seeds),
-                "http": HttpCaller(address, packed=False).score,
-                "http_base64": HttpCaller(address, packed=True).score,
+                "http": text.score,
+                "http_base64": packed.score,
             }
             seeds, random = count(), np.random.default_rng(1)
 
@@ -75,6 +76,10 @@ class HttpCaller:
         self._connection.getresponse().read()
         found = self._ask("GET", f"{base}/{batch}")
         assert None not in found["fitness"]
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._connection.close()
 
     def _ask(self, method: str, path: str, body: str | None = None) -> dict[str, Any]:
         self._connection.request(method, path, body, {"Content-Type": "application/json"})
