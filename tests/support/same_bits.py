@@ -28,15 +28,20 @@ class Outcome(NamedTuple):
 
 
 def outcome(processes, name):
-    """What a run has come to, candidate by candidate; a generation that is open does not count."""
+    """What a run has come to, candidate by candidate; a generation that is open does not count.
+
+    Nor do the episodes of a candidate that failed: how many of them were scored before that depends on the moment.
+    """
     with open_run(processes.runs, name) as run:
         history = run.history()
         closed = {each.number for each in history}
         places = [(each.generation, each.number) for each in run.candidates() if each.generation in closed]
+        fitness = [run.fitness(*place) for place in places]
+        scored = [() if each is None else run.results(*place) for place, each in zip(places, fitness, strict=True)]
         return Outcome(
-            [run.fitness(*place) for place in places],
+            fitness,
             [run.candidate(*place).tobytes() for place in places],
-            [[(each.seed, each.fitness, each.steps) for each in run.results(*place)] for place in places],
+            [[(each.seed, each.fitness, each.steps) for each in results] for results in scored],
             [(each.number, each.mean, each.best, each.sigma, each.steps) for each in history],
             run.evaluations(),
             run.confirmation(),
