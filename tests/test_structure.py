@@ -52,7 +52,7 @@ STARTING_CHILDREN = {
 WITHOUT_TEST = {
     "common/errors.py",  # exceptions alone
     # measurements, which people start
-    *(f"worker/addons/bench/{name}.py" for name in ("batches", "live", "steps", "torch_steps")),
+    *(f"worker/addons/bench/{name}.py" for name in ("live", "steps", "torch_steps")),
 }
 
 # What stands in a printed command as it is, without shlex or `shell_command`: names that were checked, and constants.

@@ -278,8 +278,9 @@ def test_the_token_is_asked_for_and_opens_the_page(browser, processes):
         address = started.address.replace("0.0.0.0", "127.0.0.1")
         page.goto(address)
         page.fill("input[name=token]", "not this one")
-        page.click("button")
-        page.wait_for_selector("text=This is not the token")
+        with page.expect_navigation() as answer:
+            page.click("button")
+        assert answer.value.status == 401
         page.fill("input[name=token]", TOKEN)
         page.click("button")
         wait(page, "no coordinator")

@@ -64,7 +64,7 @@ def test_a_noisy_search_gives_the_mean_that_was_judged_and_has_no_more_calls_tha
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*failed candidates:RuntimeWarning")
+@pytest.mark.filterwarnings("ignore:.*holed .*nan:RuntimeWarning")
 @pytest.mark.parametrize(
     ("function", "budget", "least", "given"),
     [

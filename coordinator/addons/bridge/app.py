@@ -214,9 +214,9 @@ class _Handlers:
             in_thread = asyncio.get_running_loop().run_in_executor(threads, ask) if threads else run_in_threadpool(ask)
             found = await in_thread
         except ConnectionFailedError as error:
-            seen = run in self._seen
-            text = f"{error}; ask again with the same id" if seen else str(error)
-            raise BatchError("busy" if seen else "unknown", text) from error
+            if run in self._seen:
+                raise BatchError("busy", f"{error}; ask again with the same id") from error
+            raise BatchError("unknown", str(error)) from error
         self._seen.add(run)
         self._changes.subscribe(run)
         return found
