@@ -14,7 +14,7 @@ from dreamfleet.coordinator.dispatch.packing import SentBatch
 
 TRIAL_SECONDS = 60.0  # after which a trial copy without a result is forgotten
 MAX_BACKOFF = 4  # doublings of the pause before a batch is sent again
-MOST_VERDICTS = 16 * MAX_LEASES  # that wait for a heartbeat which confirms them: 3 MB, and a second of tiny jobs
+MOST_VERDICTS = 16 * MAX_LEASES  # that wait for a heartbeat which confirms them: 2 MB, and a second of tiny jobs
 ABSENT_HEARTBEATS = 2  # in a row that confirm a job's batch and do not list the job: its lease ends
 DEPARTED_TIMEOUT = 600.0  # seconds for which a departed worker is listed, unless its host is back
 MAX_DEPARTED = 256  # departed workers that are listed, the latest ones
