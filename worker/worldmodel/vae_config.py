@@ -63,6 +63,10 @@ class VAEConfig:
     )
 
     activate_dense: bool = added_option(default=False, text="the activation after the decoder's dense layer too")
+    columns: int = added_option(
+        0, "latents of each column of the last convolution, which see little beside it, so that they keep places; "
+        "0: each latent sees the whole picture"
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         check_sizes(self)
@@ -86,6 +90,17 @@ class VAEConfig:
         if min(self.decoder_sides) < 1 or any(layer.before < 0 for layer in self.up):
             raise UsageError(
                 f"the decoder's kernels {self._up_kernels} do not lead to {self.picture} pixels: choose others"
+            )
+
+        if self.columns < 0:
+            raise UsageError(f"columns must be from 0, not {self.columns}")
+        if self.columns and self.decoder_sides[0] != self.sides[-1]:
+            raise UsageError("columns need a decoder that begins where the encoder ends: set padding to same")
+        if self.columns and self.columns * self.sides[-1] != self.latent:
+            each = plural(self.columns, "latent")
+            raise UsageError(
+                f"with {each} in each of {self.sides[-1]} columns, latent is {self.columns * self.sides[-1]}, "
+                f"not {self.latent}"
             )
 
     @property

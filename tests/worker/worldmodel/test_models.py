@@ -38,6 +38,7 @@ VAES = {
     "active dense": VAEConfig(activate_dense=True, **TINY),
     "leaky dense": VAEConfig(activate_dense=True, activation="leaky_relu", dense=6, **TINY),
     "everything": VAEConfig(activation="leaky_relu", batch_norm=True, dropout=0.1, **TINY),
+    "columns": VAEConfig(latent=32, channels=(4, 8), padding="same", columns=2),
     "everything same": VAEConfig(activation="leaky_relu", batch_norm=True, padding="same", picture=96, **TINY),
 }  # fmt: skip
 
@@ -79,6 +80,25 @@ def test_an_exported_vae_computes_what_torch_does(tmp_path, name):
     policy = PolicyStep(bundle)
     parameters = np.zeros((3, policy.shape.size), np.float32)
     np.testing.assert_allclose(policy.step(pictures, parameters, policy.zero_state(3)).latent, mu.numpy(), atol=1e-4)
+
+
+def test_the_latents_of_a_column_see_nothing_far_from_it_before_and_after_training():
+    model = VAE(VAES["columns"])
+    optimiser = torch.optim.Adam(model.parameters(), 0.01)
+    for _ in range(2):
+        pictures = torch.rand(2, 3, 64, 64)
+        changed = pictures.clone()
+        changed[..., 40:] = 0
+        with torch.no_grad():
+            seen, other = (model.encode(each)[0].view(2, 2, 16) for each in (pictures, changed))
+            moved = (model.decode(seen.flatten(1)) - model.decode(other.flatten(1))).abs().amax(dim=(0, 1, 2))
+        assert torch.equal(seen[..., :8], other[..., :8])
+        assert not torch.equal(seen[..., 10:], other[..., 10:])
+        assert not moved[:20].any()
+        assert moved[40:].all()
+        model.loss(pictures, torch.zeros(2, 32)).weighted.backward()
+        optimiser.step()
+        assert all(not part.weight[part.near == 0].any() for part in (model.mu, model.logvar, model.dense))
 
 
 @pytest.mark.parametrize("config", [mdnrnn.REWARDED, mdnrnn.NOTEBOOK, mdnrnn.ATTENTIVE, MDNRNNConfig(joint=True)])
@@ -126,6 +146,9 @@ NO_VAES = [
     {"decoder_kernels": (5, 5, 6, 7)},
     {"padding": "same", "decoder_kernels": (1, 1, 1, 1)},
     {"dropout": 1.0},
+    {"columns": -1},
+    {"columns": 2},  # the paper's decoder begins at 1x1
+    {"columns": 2, "padding": "same", "latent": 9},
     *({"pixel_weight": weight} for weight in (-1.0, float("nan"))),
 ]
 NO_MDNRNNS = [
