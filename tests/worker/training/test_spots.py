@@ -1,0 +1,39 @@
+"""Spots of synthetic pictures, whose number, size, place and loss are known. Tests spots.py."""
+
+import numpy as np
+
+from dreamfleet.worker.training.spots import find_spots, kept_shares
+
+MEAN = np.full((64, 64, 3), 40.0)
+
+
+def picture(*parts):
+    made = np.full((64, 64, 3), 40, np.uint8)
+    for rows, columns in parts:
+        made[rows, columns] = 240
+    return made
+
+
+SMALL, SNAKE, LARGE = (np.s_[10:13], np.s_[4:7]), (np.s_[30], np.s_[2:60]), (np.s_[40:60], np.s_[20:50])
+
+
+def test_each_connected_part_is_one_spot_with_its_size_and_place():
+    pictures = np.stack([picture(SMALL, LARGE), picture(SNAKE, (np.s_[31:39], np.s_[59]))])
+    spots = find_spots(pictures, pictures, MEAN, 10.0)
+    assert sorted(spots.size.tolist()) == [9, 66, 600]
+    assert spots.kept.all()
+    (small,) = np.flatnonzero(spots.size == 9)
+    assert (spots.row[small], spots.column[small]) == (11.5 / 64, 5.5 / 64)
+
+
+def test_a_spot_that_is_faint_or_elsewhere_in_the_reconstruction_is_lost():
+    pictures, away = picture(SMALL, LARGE)[None], (np.s_[10:13], np.s_[9:12])
+    faint = ((pictures - MEAN) * 0.4 + MEAN)[0]
+    for shown, kept in ((picture(LARGE), 0.0), (picture(away, LARGE), 0.0), (faint, 0.0), (pictures[0], 1.0)):
+        spots = find_spots(pictures, shown[None], MEAN, 10.0)
+        assert kept_shares(spots) == {"kept_of_spots_5_to_16": kept}
+
+
+def test_pictures_like_the_mean_have_none():
+    same = picture()[None]
+    assert kept_shares(find_spots(same, same, MEAN, 1.0)) == {}

@@ -1,0 +1,67 @@
+"""Spots: what deviates from the mean picture, and which of them a reconstruction keeps. Needs no labels.
+
+A small spot, such as a ball, is little of a picture's error, and may decide the whole episode. Pages: takecover.md.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+DEVIATIONS = 4.0  # a pixel is of a spot if it is farther from the mean picture than so many mean deviations
+KEPT = 0.5  # share of a spot's deviation that a reconstruction must show
+SIZES = ((5, 16), (17, 64))  # least and most pixels of a class; fewer are mostly noise, more no encoder loses
+Pictures = NDArray[np.uint8]
+Floats = NDArray[np.float64]
+
+
+class Spots(NamedTuple):
+    """A row for each spot: its pixels, its middle's row and column as shares of the side, and whether it is kept."""
+
+    size: NDArray[np.int64]
+    row: Floats
+    column: Floats
+    kept: NDArray[np.bool_]
+
+
+def find_spots(pictures: Pictures, decoded: NDArray[Any], mean: Floats, deviation: float) -> Spots:
+    """The spots of `pictures` `(N, side, side, 3)`, and which of them `decoded` keeps.
+
+    `mean` `(side, side, 3)` is the mean picture and `deviation` the mean of `|x - mean|`, both in bytes.
+    """
+    seen, shown = pictures - mean, decoded - mean
+    labels = _label(np.abs(seen).mean(axis=3) > DEVIATIONS * deviation)
+    flat = labels.ravel()
+    found, index = np.unique(flat[flat > 0], return_inverse=True)
+    size = np.bincount(index, minlength=len(found))
+    rows, columns = np.divmod(np.flatnonzero(flat) % labels[0].size, labels.shape[2])
+
+    def total(values: Floats) -> Floats:
+        return np.bincount(index, values, len(found)).astype(np.float64)
+
+    whole, share = (total(each.sum(axis=3).ravel()[flat > 0]) for each in (seen**2, seen * shown))
+    side = labels.shape[1]
+    return Spots(size, total(rows + 0.5) / size / side, total(columns + 0.5) / size / side, share >= KEPT * whole)
+
+
+def kept_shares(spots: Spots) -> dict[str, float]:
+    """The share of the spots of each class that is kept, by name; a class without a spot is left out."""
+    shares = {}
+    for least, most in SIZES:
+        among = (spots.size >= least) & (spots.size <= most)
+        if among.any():
+            shares[f"kept_of_spots_{least}_to_{most}"] = round(float(spots.kept[among].mean()), 3)
+    return shares
+
+
+def _label(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """A number for each connected part of each picture's `mask` `(N, side, side)`, unique over all; 0: none."""
+    labels = np.where(mask, np.arange(mask.size).reshape(mask.shape), -1)  # a pixel's label is a pixel of its part
+    while True:
+        before = labels.copy()
+        for one, other in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[:, :, 1:], np.s_[:, :, :-1])):
+            for into, of in ((one, other), (other, one)):
+                np.maximum(labels[into], labels[of], out=labels[into], where=mask[into])
+        labels[mask] = labels.ravel()[labels[mask]]  # the label's own label: parts of any shape need few turns
+        if np.array_equal(labels, before):
+            return labels + 1
