@@ -4,8 +4,8 @@ Pages: trust.md.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import gymnasium
 import numpy as np
@@ -15,15 +15,18 @@ from dreamfleet.common.addons.own_modules import trust_own_run
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.trained_agent import TrainedAgent
-from dreamfleet.common.errors import ControllerError
+from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.addons.evaluation.known_score import KnownScore, find_known_score
 from dreamfleet.worker.scoring.scorer import find_checked_world
 from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, Assignment, Policy, Task, World
+from dreamfleet.worker.tasks.masking import TaskWithMask
 from dreamfleet.worker.tasks.registry import find_scored_task, find_task, known_tasks
 from dreamfleet.worker.tasks.true_state import TaskWithTrueState, Truth
 
 Floats = NDArray[np.float32]
+Sight = Literal["own", "hidden", "foreign"]
+"""What an agent sees of what decides an episode: that, nothing of it, or another episode's."""
 Policies = Callable[[int], Policy]
 """A function from an episode's seed to its policy; the caller calls `begin`."""
 
@@ -121,6 +124,7 @@ class EvolvedAgent:
     parameters: Floats = field(repr=False)
     bundle: Bundle | None = None  # of the controller's shape and variant
     known_score: KnownScore | None = None
+    sight: Sight = "own"
 
     @property
     def assignment(self) -> Assignment:
@@ -150,6 +154,8 @@ class EvolvedAgent:
     def make_evaluation_environment(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         """Its task's evaluation environment; a task without pictures may have no parameter `render_mode`."""
         task, given = self._task, () if render_mode is None else (render_mode,)
+        if self.sight != "own" and isinstance(reality := self._reality, TaskWithMask):
+            return reality.make_masked_environment(self.assignment, foreign=self.sight == "foreign")
         return task.make_evaluation_environment(self.assignment, *given)
 
     def make_policies(self) -> Policies:
@@ -170,3 +176,10 @@ class EvolvedAgent:
     @property
     def _reality(self) -> Task:
         return self._task.reality(self.assignment)
+
+
+def masked(agent: Agent, sight: Sight) -> Agent:
+    """The same agent with this sight; `UsageError` if nothing hides in its world what decides."""
+    if isinstance(agent, EvolvedAgent) and isinstance(find_task(agent.reality), TaskWithMask):
+        return replace(agent, sight=sight)
+    raise UsageError(f"{agent.reality} has no mask over its pictures: evaluate without --blind")

@@ -4,6 +4,7 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from statistics import fmean
 from time import perf_counter
 from typing import Any
@@ -21,7 +22,7 @@ from dreamfleet.common.protocol.function_values import minimises
 from dreamfleet.common.protocol.result_bounds import rejection_reason
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
-from dreamfleet.worker.addons.evaluation.agents import Agent
+from dreamfleet.worker.addons.evaluation.agents import Agent, masked
 from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
 from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition, score
 from dreamfleet.worker.scoring.failure_cause import crash, failure_of
@@ -118,6 +119,16 @@ def judge(
         name=name, fingerprint=fingerprint(agent.world.packages), version=package_version("dreamfleet") or "",
         seconds=perf_counter() - began, drives=results.drives, failed=results.failed, **facts_of(agent),
     )  # fmt: skip
+
+
+def judge_blind(
+    name: str, agent: Agent, seeds: tuple[int, ...], jobs: int, note: Callable[[str], object] = log.warning
+) -> EvaluationReport:
+    """As `judge`, with the same seeds driven blind, and with another episode's sight; `UsageError` without a mask."""
+    blind, misled = masked(agent, "hidden"), masked(agent, "foreign")
+    report = judge(name, agent, seeds, jobs, note)
+    hidden, foreign = (judge(name, each, seeds, jobs, note).drives for each in (blind, misled))
+    return replace(report, hidden=hidden, foreign=foreign)
 
 
 def facts_of(agent: Agent) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from math import isclose
 from pathlib import Path
+from statistics import fmean
 from typing import Annotated
 
 from msgspec import Meta
@@ -20,7 +21,7 @@ from dreamfleet.common.printable import format_number, one_line, truncate
 from dreamfleet.common.protocol.function_values import minimises
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
-from dreamfleet.common.runs.standard_error import format_with_error, score_digits
+from dreamfleet.common.runs.standard_error import format_with_error, score_digits, standard_error
 from dreamfleet.common.schema.validation import OPTIONAL, MalformedError, Seconds, from_plain_lenient
 
 GYMNASIUM = "gymnasium"  # the judge of worlds that gymnasium itself has
@@ -28,6 +29,7 @@ FACTS = "controller", "task", "options", "world", "judge", "bundle", "threshold"
 MAX_MARKS = 8
 MIN_EPISODES_TO_SOLVE = 100  # customary number of episodes for gymnasium's threshold of solving an environment
 MAX_BYTES, MAX_EPISODES, MAX_SEED = 64 << 20, 10**5, 2**63
+SIGHTS = {"hidden": "blind", "foreign": "with another's sight"}  # fields of what was driven so, and how it is called
 ABOVE = "above_"  # and a mark: the share of scores above it
 Drives = Annotated[tuple[EpisodeResult, ...], Meta(min_length=1, max_length=MAX_EPISODES)]
 
@@ -54,6 +56,10 @@ class EvaluationReport:
     marks: Annotated[tuple[float, ...], Meta(max_length=MAX_MARKS)] = field(default=(), metadata=OPTIONAL)
     #: of `task`, as a run freezes them
     options: str = field(default="", metadata=OPTIONAL)
+    #: the same seeds, with what decides painted out of its pictures; empty: not driven
+    hidden: Annotated[tuple[EpisodeResult, ...], Meta(max_length=MAX_EPISODES)] = field(default=(), metadata=OPTIONAL)
+    #: the same, with what decides another episode in its place
+    foreign: Annotated[tuple[EpisodeResult, ...], Meta(max_length=MAX_EPISODES)] = field(default=(), metadata=OPTIONAL)
 
     @cached_property
     def results(self) -> EpisodeResults:
@@ -79,7 +85,28 @@ class EvaluationReport:
             "finished": results.finished, "speed": results.speed, "braking": results.braking,
             **{f"{ABOVE}{mark:g}": results.above(mark) for mark in self.marks},
             "scores": results.scores, "seeds": results.seeds,
+            **{f"{sight}_{key}": value for sight in SIGHTS for key, value in self._blind_figures(sight).items()},
         }  # fmt: skip
+
+    def _blind_figures(self, sight: str) -> dict[str, float | None]:
+        """The mean of what was driven blind, and how much less it is than with sight, seed by seed."""
+        plain = {each.seed: each.score for each in self.drives}
+        scores = [(each.seed, each.score) for each in getattr(self, sight)]
+        if not (less := [plain[seed] - score for seed, score in scores if seed in plain]):
+            return {}
+        means = [score for _, score in scores]
+        return {
+            "mean": fmean(means), "mean_error": standard_error(means),
+            "loss": fmean(less), "loss_error": standard_error(less),
+        }  # fmt: skip
+
+    def _describe_blind(self, word: str) -> list[str]:
+        lines = []
+        for sight, text in SIGHTS.items():
+            if found := self._blind_figures(sight):
+                score, loss = (format_with_error(found[key] or 0.0, found[f"{key}_error"]) for key in ("mean", "loss"))
+                lines.append(f"{text}: {score}, {loss} less, {word} by {word}")
+        return lines
 
     def describe(self, word: str = "seed") -> str:
         """A text for display: the score, figures on driving, the threshold and the controller; `word`: one seed."""
@@ -89,6 +116,7 @@ class EvaluationReport:
             failures and f"{failures}; all figures are over the episodes with a score",
             self._describe_score(word),
             ", ".join([*above, *_describe_driving(self.results)]),
+            *self._describe_blind(word),
             self._describe_threshold(word),
             self._describe_origin(),
         )

@@ -54,6 +54,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
     parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one per core)")
+    parser.add_argument(
+        "--blind", action="store_true",
+        help="drive the same episodes twice more: with what decides painted out of the pictures, and with another "
+        "episode's in its place (such as Take Cover's fireballs)",
+    )  # fmt: skip
     add_global_flags(parser, "runs_dir")
     parser.add_argument("--json", action="store_true", help="print every figure and drive as JSON")
     parser.add_argument("--out", type=Path, help="also write that JSON to this file, for `compare` and `verify report`")
@@ -93,7 +98,7 @@ def agent_flags(args: argparse.Namespace) -> tuple[object, ...]:
 
 def run(args: argparse.Namespace) -> int:
     """Drive, and print the scores."""
-    from dreamfleet.worker.addons.evaluation.evaluation import judge
+    from dreamfleet.worker.addons.evaluation.evaluation import judge, judge_blind
 
     if args.episodes < 1 or args.first_seed < 0 or args.jobs < 1:
         raise UsageError("--episodes and --jobs must be at least 1, --first-seed at least 0")
@@ -106,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
     if seeds[0] not in TEST or seeds[-1] not in TEST:
         some = "some" if seeds[0] < TEST.stop and seeds[-1] >= TEST.start else "none"
         note(f"note: test seeds are {TEST.start} to {TEST.stop - 1}; {some} of these are among them")
-    judgement = judge(name, agent, seeds, args.jobs, note)
+    judgement = (judge_blind if args.blind else judge)(name, agent, seeds, args.jobs, note)
     print(judgement.to_json() if args.json else judgement.describe(agent.world.score_word), flush=True)
     if args.out:
         with open_output(args.out) as file:

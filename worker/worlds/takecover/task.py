@@ -20,6 +20,7 @@ from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.tasks.registry import preprocessing_for
 from dreamfleet.worker.worldmodel.policy import ModelPolicy
 from dreamfleet.worker.worlds.takecover.game import BAND, LEFT, RIGHT, STAY, TakeCover, observe_band
+from dreamfleet.worker.worlds.takecover.masking import MaskedTakeCover
 from dreamfleet.worker.worlds.takecover.options import TakeCoverOptions
 
 PACKAGES = ("numpy", "onnxruntime", "vizdoom")
@@ -105,15 +106,16 @@ class TakeCoverTask(Task):
     def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
         """The game in the world model's pictures, or without a world model as a band of pixels."""
         task = self._bound_to(assignment)
-        if assignment.bundle is None:
-            band = spaces.Box(0, 1, (BAND,), np.float32)
-            return task._with_actions(TransformObservation(task._make_game(), observe_band, band))
-        return task.make_recorded(preprocessing_for(assignment.bundle, task).name)
+        return task._observed(task._make_game(), assignment)
+
+    def make_masked_environment(self, assignment: Assignment, *, foreign: bool) -> gymnasium.Env[Any, Any]:
+        """The same without fireballs in its pictures, or with those of another game."""
+        task = self._bound_to(assignment)
+        return task._observed(MaskedTakeCover(task._make_game(), task._make_game() if foreign else None), assignment)
 
     def make_recorded(self, preprocessing: str) -> gymnasium.Env[Any, Any]:
         """The game in the preprocessing of this name."""
-        pictures = CropAndResize(self._make_game(), self.preprocessings[preprocessing].size, self._options.part)
-        return self._with_actions(pictures)
+        return self._recorded(self._make_game(), preprocessing)
 
     def make_evaluation_environment(
         self, assignment: Assignment, render_mode: str | None = None  # noqa: ARG002 - the game always draws
@@ -139,6 +141,15 @@ class TakeCoverTask(Task):
             return self.with_options(assignment.spec.options)
         manifest = assignment.bundle.manifest
         return self if manifest.task != self.name else self.with_options(manifest.world.options)
+
+    def _observed(self, game: gymnasium.Env[Any, Any], assignment: Assignment) -> gymnasium.Env[Any, Any]:
+        if assignment.bundle is None:
+            band = spaces.Box(0, 1, (BAND,), np.float32)
+            return self._with_actions(TransformObservation(game, observe_band, band))
+        return self._recorded(game, preprocessing_for(assignment.bundle, self).name)
+
+    def _recorded(self, game: gymnasium.Env[Any, Any], preprocessing: str) -> gymnasium.Env[Any, Any]:
+        return self._with_actions(CropAndResize(game, self.preprocessings[preprocessing].size, self._options.part))
 
     def _make_game(self) -> TakeCover:
         return TakeCover(self._options.tics)

@@ -1,0 +1,75 @@
+"""Take Cover with its fireballs painted out, or with those of another game in their place. Pages: takecover.md."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from dreamfleet.common.runs.seeds import fold_seed
+from dreamfleet.worker.worlds.takecover.game import Pixels, TakeCover
+
+HORIZON = 40  # first row of the picture that fireballs reach; above it are the sky and its lights
+OTHER_GAME = 1_000_003  # added to an episode's seed for the game whose fireballs it shows
+Mask = NDArray[np.bool_]
+
+
+def find_fireballs(picture: Pixels) -> Mask:
+    """The pixels `(120, 160)` of fireballs, with one more at each edge."""
+    red, green, blue = (picture[..., channel].astype(np.int16) for channel in range(3))
+    hot = (red > 150) & (green > 100) & (red - blue > 60) | (red > 190) & (green > 150)
+    hot[:HORIZON] = False
+    grown = hot.copy()
+    grown[:, 1:] |= hot[:, :-1]
+    grown[:, :-1] |= hot[:, 1:]
+    hot = grown.copy()
+    grown[1:] |= hot[:-1]
+    grown[:-1] |= hot[1:]
+    return grown
+
+
+def paint_out(picture: Pixels, mask: Mask) -> Pixels:
+    """The picture with each pixel of `mask` as the last other one to its left, at the left edge as the first other."""
+    columns = np.where(mask, -1, np.arange(mask.shape[1]))
+    source = np.maximum.accumulate(columns, axis=1)
+    source = np.where(source < 0, np.argmin(mask, axis=1)[:, None], source)
+    painted: Pixels = np.take_along_axis(picture, source[..., None], axis=1)
+    return painted
+
+
+class MaskedTakeCover(gymnasium.Wrapper[Pixels, int, Pixels, int]):
+    """The same game, whose pictures hold no fireballs, or those of `other`, a game in which the same is done."""
+
+    def __init__(self, game: TakeCover, other: TakeCover | None) -> None:
+        super().__init__(game)
+        self._other = other
+        self._foreign: Pixels | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Pixels, dict[str, Any]]:
+        """Begin the episode of this seed."""
+        picture, info = self.env.reset(seed=seed, options=options)
+        if self._other is not None:
+            self._foreign, _ = self._other.reset(seed=None if seed is None else fold_seed(seed) + OTHER_GAME)
+        return self._painted(picture), info
+
+    def step(self, action: int) -> tuple[Pixels, Any, bool, bool, dict[str, Any]]:
+        """Do the same in both games; where the other one ends, another begins."""
+        picture, reward, terminated, truncated, info = self.env.step(action)
+        if self._other is not None:
+            self._foreign, _, *ends, _ = self._other.step(action)
+            if any(ends):
+                self._foreign, _ = self._other.reset()
+        return self._painted(picture), reward, terminated, truncated, info
+
+    def close(self) -> None:
+        """End both games' processes."""
+        super().close()
+        if self._other is not None:
+            self._other.close()
+
+    def _painted(self, picture: Pixels) -> Pixels:
+        painted = paint_out(picture, find_fireballs(picture))
+        if self._foreign is not None:
+            there = find_fireballs(self._foreign)
+            painted[there] = self._foreign[there]
+        return painted
