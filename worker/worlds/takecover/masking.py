@@ -15,17 +15,24 @@ Mask = NDArray[np.bool_]
 
 
 def find_fireballs(picture: Pixels) -> Mask:
-    """The pixels `(120, 160)` of fireballs, with one more at each edge."""
+    """The pixels `(120, 160)` of fireballs, with one more at each edge.
+
+    Their middle is brighter than anything else; orange that does not touch it is an imp's.
+    """
     red, green, blue = (picture[..., channel].astype(np.int16) for channel in range(3))
-    hot = (red > 150) & (green > 100) & (red - blue > 60) | (red > 190) & (green > 150)
-    hot[:HORIZON] = False
-    grown = hot.copy()
-    grown[:, 1:] |= hot[:, :-1]
-    grown[:, :-1] |= hot[:, 1:]
-    hot = grown.copy()
-    grown[1:] |= hot[:-1]
-    grown[:-1] |= hot[1:]
-    return grown
+    found = (red > 190) & (green > 150)
+    found[:HORIZON] = False
+    orange = (red > 150) & (green > 100) & (red - blue > 60)
+    for _ in range(2):
+        found |= _grown(found) & orange
+    return _grown(found)
+
+
+def _grown(mask: Mask) -> Mask:
+    """The mask with its neighbours above, below and aside, corners included."""
+    padded = np.pad(mask, 1)
+    wide = padded[:, 2:] | padded[:, 1:-1] | padded[:, :-2]
+    return wide[2:] | wide[1:-1] | wide[:-2]
 
 
 def paint_out(picture: Pixels, mask: Mask) -> Pixels:
