@@ -15,10 +15,10 @@ from dreamfleet.worker.tasks.api import Continuous, Score, Task, World
 
 MODULE = "tests.support.tasks"
 NAMES = """Toy SlowToy Raising Crashing Nan Hanging Silent Judged Counted Heavy Chatty Painted Rounded SecondToy Brittle
-Exploding"""
+Exploding Masked"""
 (
     TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, CHATTY, PAINTED, ROUNDED,
-    SECOND_TOY, BRITTLE, EXPLODING,
+    SECOND_TOY, BRITTLE, EXPLODING, MASKED,
 ) = (f"{MODULE}:{name}" for name in NAMES.split())  # fmt: skip
 ALL = TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, PAINTED
 STEPS_FOLDER = "DREAMFLEET_TEST_STEPS"  # where `Counted` writes
@@ -77,6 +77,14 @@ class SlowToy(Toy):
     """An episode takes about a third of a second."""
 
     seconds = 0.03
+
+
+class Masked(Toy):
+    """Each of the ten steps of an episode costs 1 without sight, and 2 with another's."""
+
+    def make_masked_environment(self, assignment, *, foreign):
+        cost = 2 if foreign else 1
+        return gymnasium.wrappers.TransformReward(self.make_environment(assignment), lambda reward: reward - cost)
 
 
 class SecondToy(Toy):

@@ -201,6 +201,22 @@ def test_the_report_is_what_it_prints_and_can_be_repeated_to_the_bit(random_bund
         assert (code, "efefefefefef" in err) == (1, True)
 
 
+def test_blind_episodes_stand_beside_those_with_sight(words, tmp_path):
+    out, flags = tmp_path / "report.json", ("--episodes", 3, "--jobs", 1, "--json")
+    plain = json.loads(call_here(*words(tasks.MASKED, *flags))[1])
+    code, said, _ = call_here(*words(tasks.MASKED, *flags, "--blind", "--out", out))
+    found, recorded = json.loads(said), read_evaluation_report(out)
+    assert (code, found["scores"]) == (0, plain["scores"])
+    assert (found["hidden_loss"], found["foreign_loss"]) == (pytest.approx(10), pytest.approx(20))
+    assert (found["hidden_mean"], found["foreign_mean"]) == (
+        pytest.approx(plain["mean"] - 10), pytest.approx(plain["mean"] - 20)
+    )  # fmt: skip
+    assert [each.seed for each in recorded.foreign] == found["seeds"]
+    assert "20" in recorded.describe().splitlines()[2]
+    code, _, err = call_here(*words(tasks.TOY, *flags, "--blind"))
+    assert (code, "--blind" in err) == (2, True)
+
+
 def test_an_unwritable_report_is_an_error_before_the_first_episode(words, tmp_path):
     code, _, err = call_here(*words(tasks.HANGING, "--out", tmp_path))
     assert (code, str(tmp_path) in err) == (2, True)
