@@ -158,6 +158,11 @@ class EvolvedAgent:
             return reality.make_masked_environment(self.assignment, foreign=self.sight == "foreign")
         return task.make_evaluation_environment(self.assignment, *given)
 
+    @property
+    def has_mask(self) -> bool:
+        """Whether the task that it is evaluated in can hide what decides."""
+        return isinstance(self._reality, TaskWithMask)
+
     def make_policies(self) -> Policies:
         """Its task's policy, the same one in each episode."""
         policy = self._task.make_policy(self.assignment)
@@ -180,6 +185,6 @@ class EvolvedAgent:
 
 def masked(agent: Agent, sight: Sight) -> Agent:
     """The same agent with this sight; `UsageError` if nothing hides in its world what decides."""
-    if isinstance(agent, EvolvedAgent) and isinstance(find_task(agent.reality), TaskWithMask):
+    if isinstance(agent, EvolvedAgent) and agent.has_mask:
         return replace(agent, sight=sight)
     raise UsageError(f"{agent.reality} has no mask over its pictures: evaluate without --blind")

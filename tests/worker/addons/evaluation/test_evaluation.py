@@ -203,8 +203,11 @@ def test_the_report_is_what_it_prints_and_can_be_repeated_to_the_bit(random_bund
 
 def test_blind_episodes_stand_beside_those_with_sight(words, tmp_path):
     out, flags = tmp_path / "report.json", ("--episodes", 3, "--jobs", 1, "--json")
-    plain = json.loads(call_here(*words(tasks.MASKED, *flags))[1])
-    code, said, _ = call_here(*words(tasks.MASKED, *flags, "--blind", "--out", out))
+    code, said, err = call_here(*words(tasks.MASKED, *flags))
+    assert code == 0, err
+    plain = json.loads(said)
+    code, said, err = call_here(*words(tasks.MASKED, *flags, "--blind", "--out", out))
+    assert code == 0, err
     found, recorded = json.loads(said), read_evaluation_report(out)
     assert (code, found["scores"]) == (0, plain["scores"])
     assert (found["hidden_loss"], found["foreign_loss"]) == (pytest.approx(10), pytest.approx(20))
