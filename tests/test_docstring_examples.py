@@ -8,12 +8,12 @@ import pytest
 
 import dreamfleet
 from deploy.structure import ROOT, SIDES, module_of, sources
-from dreamfleet.common.artifacts.trained_agent import AgentManifest, TrainedAgent
 from dreamfleet.coordinator.optimisers import api as optimisers_api
 from dreamfleet.worker.addons.baselines.export import export_network
 from dreamfleet.worker.addons.baselines.network import Networks
 from dreamfleet.worker.addons.baselines.presets import AgentConfig
 from dreamfleet.worker.tasks import api as tasks_api
+from dreamfleet.worker.worlds.trained_agent import AgentManifest, TrainedAgent
 from tests.support.processes import processes_in
 
 RUN = "cartpole"  # the live run of the examples

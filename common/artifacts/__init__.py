@@ -1,4 +1,4 @@
-"""Files that a run reads and writes: bundles, controllers, agents, subspaces; and what their vectors mean to a task.
+"""Files that a run reads and writes: bundles, controllers, subspaces; and what their vectors mean to a task.
 
 Pages: files.md, worlds.md, import.md, determinism.md.
 """
@@ -14,6 +14,5 @@ __all__ = [
     "driving",
     "car_racing_variants",
     "objective",
-    "trained_agent",
     "onnx_checks",
 ]

@@ -219,7 +219,8 @@ class Controller(Displayed):
             raise ControllerError(f"{path}: {error}") from error
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             reason = f": {error}" if path.suffix.lower() in ("", ".npz") else ""
-            raise ControllerError(f"{path} is not a controller file{reason}; {import_hint(path)}") from error
+            agent = "; `evaluate`, `record` and `verify report` play a trained agent" * (path.suffix.lower() == ".zip")
+            raise ControllerError(f"{path} is not a controller file{reason}; {import_hint(path)}{agent}") from error
 
     @classmethod
     def _parse(cls, parameters: NDArray[Any], about: dict[str, Any]) -> Controller:

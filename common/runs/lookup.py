@@ -15,7 +15,6 @@ from dreamfleet.common.artifacts.bundle_store import (
 )
 from dreamfleet.common.artifacts.controller import Controller, import_hint
 from dreamfleet.common.artifacts.subspace import Subspace
-from dreamfleet.common.artifacts.trained_agent import TrainedAgent, is_agent
 from dreamfleet.common.errors import (
     BundleError,
     ConnectionFailedError,
@@ -37,21 +36,10 @@ SUBSPACES = "subspaces"  # the folder of shipped subspaces: of a world model, by
 
 
 def find_controller(name: str, runs_dir: Path) -> tuple[Controller, Path | None]:
-    """The controller of this name, and the path of a bundle beside it; `ControllerError` for a trained agent."""
-    found, beside = find_agent(name, runs_dir)
-    if isinstance(found, TrainedAgent):
-        raise ControllerError(
-            f"{name} is a trained agent, which `evaluate`, `record` and `verify report` take: a controller's "
-            "parameters are needed here"
-        )
-    return found, beside
-
-
-def find_agent(name: str, runs_dir: Path) -> tuple[Controller | TrainedAgent, Path | None]:
-    """The controller or trained agent of this name, and the path beside it where a bundle may be."""
+    """The controller of this name, and the path beside it where a bundle may be."""
     path, run, shipped = Path(name), runs_dir / name, pretrained_folder() / f"{name}.npz"
     if is_file(path):
-        return TrainedAgent.load(path) if is_agent(path) else Controller.load(path), path.parent / BUNDLE
+        return Controller.load(path), path.parent / BUNDLE
     for folder in (run, path):  # a run's name, or its folder
         if is_file(folder / CONTROLLER) and is_file(folder / JOURNAL):
             with RunFolder(folder) as stored:
@@ -143,14 +131,13 @@ def find_evaluated_mean(name: str, runs_dir: Path, generation: int) -> tuple[Con
 
 
 def find_bundle_of(
-    controller: Controller | TrainedAgent, named: str | None, beside: Path | None = None,
-    remedy: str = "name it with --bundle FILE",
-) -> Bundle | None:  # fmt: skip
+    controller: Controller, named: str | None, beside: Path | None = None, remedy: str = "name it with --bundle FILE"
+) -> Bundle | None:
     """The world model that a controller was evolved with: the `named` one, or one beside it, cached or shipped.
 
-    `None` for a trained agent, and if its task needs none. `BundleError` with the `remedy` if it is missing.
+    `None` if its task needs none. `BundleError` with the `remedy` if it is missing.
     """
-    if isinstance(controller, TrainedAgent) or not controller.bundle:
+    if not controller.bundle:
         return None
     if named is not None:
         bundle = find_bundle(named)

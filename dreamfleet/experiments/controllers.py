@@ -7,7 +7,6 @@ import gymnasium
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.artifacts.trained_agent import TrainedAgent
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.trusted_modules import trust_meanwhile
@@ -18,6 +17,7 @@ from dreamfleet.common.runs.seeds import TEST
 from dreamfleet.worker.addons.evaluation import evaluation
 from dreamfleet.worker.addons.evaluation.agents import Agent, make_agent
 from dreamfleet.worker.tasks.api import Policy
+from dreamfleet.worker.worlds.trained_agent import TrainedAgent
 
 
 def find_controller(name: str, runs_dir: Path | str | None = None) -> Controller:
@@ -104,4 +104,6 @@ def evaluate(
 
 
 def _agent(controller: Controller | TrainedAgent, bundle: Bundle | None) -> Agent:
-    return make_agent(controller, bundle or lookup.find_bundle_of(controller, None))
+    if bundle is None and isinstance(controller, Controller):
+        bundle = lookup.find_bundle_of(controller, None)
+    return make_agent(controller, bundle)

@@ -251,7 +251,7 @@ import json, sys
 from pathlib import Path
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.artifacts.trained_agent import TrainedAgent
+from dreamfleet.worker.worlds.trained_agent import TrainedAgent
 from dreamfleet.common.errors import DreamfleetError
 said = {}
 for path in map(Path, sys.argv[1:]):

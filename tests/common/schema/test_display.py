@@ -7,11 +7,11 @@ import pytest
 
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
-from dreamfleet.common.artifacts.trained_agent import AgentManifest, TrainedAgent
 from dreamfleet.common.client.status import WorkerStatus, read_document, read_status
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.coordinator.addons.runs.stored_run import StoredRun
+from dreamfleet.worker.worlds.trained_agent import AgentManifest, TrainedAgent
 from tests.support.journals import RUNS
 
 GOLDEN = Path(__file__).parents[1] / "golden"

@@ -7,7 +7,6 @@ import numpy as np
 from onnx import TensorProto
 
 from dreamfleet.common.artifacts.driving import FIRST_WORLD
-from dreamfleet.common.artifacts.trained_agent import AgentManifest, TrainedAgent
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.host.processes import shell_command
@@ -18,6 +17,7 @@ from dreamfleet.worker.training.checkpoint import load_checkpoint, load_config
 from dreamfleet.worker.training.data.dataset import preprocessing_of_size
 from dreamfleet.worker.worldmodel.mdnrnn_graph import Weights, lstm
 from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
+from dreamfleet.worker.worlds.trained_agent import AgentManifest, TrainedAgent
 
 
 def export_agent(folder: Path) -> TrainedAgent:

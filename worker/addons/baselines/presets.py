@@ -6,13 +6,13 @@ from itertools import pairwise
 from typing import Literal
 
 from dreamfleet.common.artifacts.actions import FIVE_CHOICES
-from dreamfleet.common.artifacts.trained_agent import MAX_FRAME_SKIP
 from dreamfleet.common.cli.bounds import NotNegative, Positive, check_bounds
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.messages import Share
 from dreamfleet.common.schema.validation import Count
 from dreamfleet.worker.addons.evaluation.named_agents import DISCRETE, RANDOM
+from dreamfleet.worker.worlds.trained_agent import MAX_FRAME_SKIP
 
 DRQN = "drqn"
 NAMES = (RANDOM, DISCRETE, DRQN)  # of the baselines

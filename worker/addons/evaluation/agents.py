@@ -14,15 +14,14 @@ from numpy.typing import NDArray
 from dreamfleet.common.addons.own_modules import trust_own_run
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.artifacts.trained_agent import TrainedAgent
 from dreamfleet.common.errors import ControllerError, UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.addons.evaluation.known_score import KnownScore, find_known_score
 from dreamfleet.worker.scoring.scorer import find_checked_world
 from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, Assignment, Policy, Task, World
-from dreamfleet.worker.tasks.masking import TaskWithMask
 from dreamfleet.worker.tasks.registry import find_scored_task, find_task, known_tasks
 from dreamfleet.worker.tasks.true_state import TaskWithTrueState, Truth
+from dreamfleet.worker.worlds.trained_agent import TrainedAgent
 
 Floats = NDArray[np.float32]
 Sight = Literal["own", "hidden", "foreign"]
@@ -83,6 +82,17 @@ class TaskWithTrainedAgents(Protocol):
 
     def make_trained_agent(self, trained: TrainedAgent, /) -> Agent:
         """The agent of a file; `ControllerError` if it cannot drive in this task."""
+
+
+@runtime_checkable
+class TaskWithMask(Protocol):  # docs/reference/worlds.md
+    """Optional: a task whose evaluation environment has a twin with changed pictures and the same episodes.
+
+    A controller that looks loses by either change; one that moves by habit loses by neither.
+    """
+
+    def make_masked_environment(self, assignment: Assignment, *, foreign: bool) -> gymnasium.Env[Any, Any]:
+        """The environment with what decides painted out; if `foreign`, with another episode's in its place."""
 
 
 def make_agent(controller: Controller | TrainedAgent, bundle: Bundle | None = None) -> Agent:

@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.files.regular_files import path_exists
+from dreamfleet.common.files.regular_files import is_file, path_exists
 from dreamfleet.common.host.add_ons import add_on, find_add_on
-from dreamfleet.common.runs.lookup import find_agent, find_bundle_of
+from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
+from dreamfleet.worker.worlds.trained_agent import TrainedAgent, is_agent
 
 if TYPE_CHECKING:
     from dreamfleet.worker.addons.evaluation.agents import Agent
@@ -46,7 +48,15 @@ def find_driver(
     from dreamfleet.worker.addons.evaluation.agents import make_agent
 
     controller, beside = find_agent(name, runs_dir)
-    return make_agent(controller, find_bundle_of(controller, bundle, beside))
+    return make_agent(
+        controller, None if isinstance(controller, TrainedAgent) else find_bundle_of(controller, bundle, beside)
+    )
+
+
+def find_agent(name: str, runs_dir: Path) -> tuple[Controller | TrainedAgent, Path | None]:
+    """The controller or trained agent of this name, and the path beside it where a bundle may be."""
+    path = Path(name)
+    return (TrainedAgent.load(path), None) if is_file(path) and is_agent(path) else find_controller(name, runs_dir)
 
 
 def is_random(name: str, runs_dir: Path) -> bool:

@@ -10,13 +10,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.host.resource_limits import usable_cores
-from dreamfleet.common.runs.lookup import find_agent, find_bundle_of
+from dreamfleet.common.runs.lookup import find_bundle_of
 from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport, read_evaluation_report
-from dreamfleet.worker.addons.evaluation.named_agents import is_random, make_random_agent
+from dreamfleet.worker.addons.evaluation.named_agents import find_agent, is_random, make_random_agent
 from dreamfleet.worker.addons.verification.reproduction import Reproduction
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def _find_recorded_agent(args: argparse.Namespace, path: Path, recorded: Evaluat
             f"{path} records the controller {recorded.controller[:12]}, and {recorded.name} is "
             f"{controller.sha256[:12]}: take the one that was recorded, or record this one with `dreamfleet evaluate`"
         )
-    bundle = find_bundle_of(controller, args.bundle, beside)
+    bundle = find_bundle_of(controller, args.bundle, beside) if isinstance(controller, Controller) else None
     if bundle is not None and bundle.sha256 != recorded.bundle:
         raise BundleError(
             f"{path} records drives by the world model {recorded.bundle[:12] or 'of none'}, and this is "

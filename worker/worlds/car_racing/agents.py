@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
-from dreamfleet.common.artifacts.trained_agent import NETWORK, TrainedAgent
 from dreamfleet.common.errors import ControllerError
 from dreamfleet.worker.tasks.api import Policy, World
 from dreamfleet.worker.tasks.model_free_policies import NO_PARAMETERS, FrameSkipPolicy
 from dreamfleet.worker.worldmodel.inference import open_untrusted_graph
 from dreamfleet.worker.worlds.car_racing.preprocessing import PREPROCESSINGS, find_preprocessing
 from dreamfleet.worker.worlds.car_racing.task import WORLD, CarRacingTask, make_judging_environment
+from dreamfleet.worker.worlds.trained_agent import NETWORK, TrainedAgent
 
 Floats = NDArray[np.float32]
 

@@ -29,8 +29,8 @@ from dreamfleet.worker.worlds.car_racing.random_network import RandomNetworkPoli
 from dreamfleet.worker.worlds.car_racing.true_state import read_true_state
 
 if TYPE_CHECKING:
-    from dreamfleet.common.artifacts.trained_agent import TrainedAgent
     from dreamfleet.worker.worlds.car_racing.agents import NetworkAgent
+    from dreamfleet.worker.worlds.trained_agent import TrainedAgent
 
 ENVIRONMENT = "CarRacing-v3"
 WORLD = World(

@@ -1,5 +1,5 @@
 """The network learns in the real CarRacing; an interrupted training resumes to the same bits; its export drives alike.
-Tests export.py, presets.py, progress.py, train.py, verb.py, common/artifacts/trained_agent.py and
+Tests export.py, presets.py, progress.py, train.py, verb.py, worker/worlds/trained_agent.py and
 worker/worlds/car_racing/agents.py."""
 
 import hashlib
@@ -17,10 +17,9 @@ import pytest
 import torch
 
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH
-from dreamfleet.common.artifacts.trained_agent import MANIFEST, NETWORK, TrainedAgent
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import ControllerError, DatasetError, StoppedError, UsageError
-from dreamfleet.common.runs.lookup import find_agent, find_controller
+from dreamfleet.common.runs.lookup import find_controller
 from dreamfleet.worker.addons.baselines import train
 from dreamfleet.worker.addons.baselines import verb as baseline
 from dreamfleet.worker.addons.baselines.export import export_agent, export_network
@@ -30,7 +29,7 @@ from dreamfleet.worker.addons.baselines.train import CHECKPOINT, CURVE, episode_
 from dreamfleet.worker.addons.evaluation import evaluation
 from dreamfleet.worker.addons.evaluation.agents import make_agent
 from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
-from dreamfleet.worker.addons.evaluation.named_agents import find_driver
+from dreamfleet.worker.addons.evaluation.named_agents import find_agent, find_driver
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.model_free_policies import NO_PARAMETERS
 from dreamfleet.worker.training.checkpoint import load_config, load_progress, load_weights, save_checkpoint
@@ -39,6 +38,7 @@ from dreamfleet.worker.worldmodel.vae import VAE
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from dreamfleet.worker.worlds.car_racing.agents import NetworkPolicy
 from dreamfleet.worker.worlds.car_racing.native_check import make_car_racing
+from dreamfleet.worker.worlds.trained_agent import MANIFEST, NETWORK, TrainedAgent
 from tests.support.disks import file_size_limit
 from tests.support.verbs import run_verb
 
