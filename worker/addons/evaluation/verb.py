@@ -57,7 +57,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--blind", action="store_true",
         help="drive the same episodes twice more: with what decides painted out of the pictures, and with another "
-        "episode's in its place (such as Take Cover's fireballs)",
+        "episode's in its place",
     )  # fmt: skip
     add_global_flags(parser, "runs_dir")
     parser.add_argument("--json", action="store_true", help="print every figure and drive as JSON")
