@@ -5,8 +5,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import gymnasium
 import numpy as np
 from numpy.random import SeedSequence
 from numpy.typing import NDArray
@@ -21,12 +22,14 @@ from dreamfleet.common.protocol.tasks import describe_task
 from dreamfleet.worker.addons.baselines.presets import CHECKPOINT
 from dreamfleet.worker.addons.evaluation.agents import Agent, EvolvedAgent
 from dreamfleet.worker.addons.evaluation.named_agents import DISCRETE, RANDOM
-from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT
+from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, World
 from dreamfleet.worker.tasks.drivers import UniformActions
 from dreamfleet.worker.tasks.model_free_policies import NO_PARAMETERS
 from dreamfleet.worker.tasks.registry import find_task
-from dreamfleet.worker.worlds.car_racing.agents import NetworkAgent, PictureAgent
+from dreamfleet.worker.tasks.true_state import Truth
 from dreamfleet.worker.worlds.car_racing.preprocessing import RAW
+from dreamfleet.worker.worlds.car_racing.task import WORLD, CarRacingTask
+from dreamfleet.worker.worlds.network_agent import NetworkAgent
 
 Floats = NDArray[np.float32]
 ACTIONS_KEY = (3,)  # of the seed's child that random actions come from
@@ -52,8 +55,16 @@ class RandomPolicy:
 
 
 @dataclass(frozen=True)
-class CarRacingRandomAgent(PictureAgent):
+class CarRacingRandomAgent:
     """One of CarRacing's two random drivers; the episode's seed is its random seed."""
+
+    task: ClassVar[str] = CarRacingTask.name
+    reality: ClassVar[str] = CarRacingTask.name
+    world: ClassVar[World] = WORLD
+    options: ClassVar[str] = ""
+    bundle: ClassVar[None] = None
+    parameters: ClassVar[Floats] = NO_PARAMETERS
+    known_score: ClassVar[None] = None
 
     name: str
 
@@ -63,9 +74,13 @@ class CarRacingRandomAgent(PictureAgent):
         return _hash(self.name)
 
     @property
-    def preprocessing(self) -> str:
-        """It ignores pictures, so the raw ones do."""
-        return RAW.name
+    def truth(self) -> Truth:
+        """The task's function from an environment to its true state."""
+        return CarRacingTask().truth
+
+    def make_evaluation_environment(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+        """The environment that scores come from; it ignores pictures, so the raw ones do."""
+        return CarRacingTask().make_agent_environment(RAW.name, render_mode)
 
     def make_policies(self) -> Callable[[int], RandomPolicy]:
         """Return a function from an episode's seed to a policy."""

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from dreamfleet.common.addons.own_modules import trust_own_run
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
-from dreamfleet.common.errors import ControllerError, UsageError
+from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.worker.addons.evaluation.known_score import KnownScore, find_known_score
 from dreamfleet.worker.scoring.scorer import find_checked_world
 from dreamfleet.worker.tasks.api import ENVIRONMENT_LIMIT, Assignment, Policy, Task, World
-from dreamfleet.worker.tasks.registry import find_scored_task, find_task, known_tasks
+from dreamfleet.worker.tasks.registry import find_scored_task
 from dreamfleet.worker.tasks.true_state import TaskWithTrueState, Truth
+from dreamfleet.worker.worlds.network_agent import NetworkAgent
 from dreamfleet.worker.worlds.trained_agent import TrainedAgent
 
 Floats = NDArray[np.float32]
@@ -77,14 +78,6 @@ class Agent(Protocol):
 
 
 @runtime_checkable
-class TaskWithTrainedAgents(Protocol):
-    """Optional: a task in which trained agents drive."""
-
-    def make_trained_agent(self, trained: TrainedAgent, /) -> Agent:
-        """The agent of a file; `ControllerError` if it cannot drive in this task."""
-
-
-@runtime_checkable
 class TaskWithMask(Protocol):  # docs/reference/worlds.md
     """Optional: a task whose evaluation environment has a twin with changed pictures and the same episodes.
 
@@ -101,12 +94,7 @@ def make_agent(controller: Controller | TrainedAgent, bundle: Bundle | None = No
     `ControllerError`, `BundleError` or `UsageError` if it does not fit the tasks and packages of this host.
     """
     if isinstance(controller, TrainedAgent):
-        # Other names could load any code.
-        task = find_task(controller.task) if controller.task in known_tasks() else None
-        if isinstance(task, TaskWithTrainedAgents):
-            return task.make_trained_agent(controller)
-        seen = f"the agent sees {controller.manifest.preprocessing!r} of {controller.task!r}"
-        raise ControllerError(f"{seen}, and no task of this name takes trained agents here")
+        return NetworkAgent(controller)
     trust_own_run(controller.provenance.get("run_uid"), controller.task, controller.options)
     fitting = None if bundle is None else bundle.for_controller(controller)
     agent = EvolvedAgent(

@@ -1,15 +1,18 @@
-"""What a file or folder of another project holds, by the names in it, and what cannot be read here; nothing is read."""
+"""What files or folders of other projects hold, by the names in them, and what is not read here; no data are read."""
 
 from pathlib import Path
 
 from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.files.archives import ArchiveLimits, DamagedArchiveError, open_archive
+from dreamfleet.common.files.regular_files import open_regular
 
 PLACES = {  # in a folder of hardmaru/WorldModelsExperiments
-    "vae.json": ("vae.json", "vae/vae.json"),
-    "rnn.json": ("rnn.json", "rnn/rnn.json"),
-    "initial_z.json": ("initial_z.json", "initial_z/initial_z.json"),
+    "vae.json": ("vae.json", "vae/vae.json", "tf_models/vae.json"),
+    "rnn.json": ("rnn.json", "rnn/rnn.json", "tf_models/rnn.json"),
+    "initial_z.json": ("initial_z.json", "initial_z/initial_z.json", "tf_models/initial_z.json"),
 }
 CHECKPOINTS = ("best.tar", "checkpoint.tar")  # of ctallec/world-models; the second has the last epoch's weights
+AGENT_ARRAY, AGENT_LIMITS = "params", ArchiveLimits(1 << 20, members=8)  # of AttentionAgent, which has no other array
 VAE, MDRNN, CONTROLLER = "vae", "mdrnn", "ctrl"  # the folders with these
 
 
@@ -38,6 +41,15 @@ def checkpoint_of(source: Path) -> Path | None:
     if source.is_dir():
         return next((source / name for name in CHECKPOINTS if (source / name).is_file()), None)
     return source if source.suffix.lower() == ".tar" else None
+
+
+def is_attention_agent(path: Path) -> bool:
+    """Whether a file is of AttentionAgent."""
+    try:
+        with open_regular(path) as file, open_archive(file, AGENT_LIMITS) as archive:
+            return archive.names == {f"{AGENT_ARRAY}.npy"}
+    except (OSError, DamagedArchiveError):
+        return False
 
 
 def drive_paths(source: Path) -> list[Path]:

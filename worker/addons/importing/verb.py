@@ -68,6 +68,8 @@ def run(args: argparse.Namespace) -> int:
     sources.refuse_unreadable(source)
     if source.is_dir() and sources.holds_json_model(source):
         return _import_world_model(args)
+    if source.suffix == ".npz" and sources.is_attention_agent(source):
+        return _import_agent(args)
     if source.suffix == ".npz" or (source.is_dir() and sources.drive_paths(source)):
         return _import_drives(args)
     return _import_controller(args)
@@ -86,6 +88,18 @@ def _import_world_model(args: argparse.Namespace) -> int:
         f"parameters, sha256 {bundle.sha256}; `{take}` takes a controller"
     )
     print_answer(args, text, bundle=bundle.path, sha256=bundle.sha256)
+    return 0
+
+
+def _import_agent(args: argparse.Namespace) -> int:
+    from dreamfleet.worker.addons.importing.attention_agent import import_attention_agent
+
+    check_output_path(args.out)
+    agent = import_attention_agent(args.source)
+    with reporting_write_errors(args.out):
+        agent.save(args.out)
+    text = f"{args.out}: {agent}; `{shell_command('evaluate', '--controller', args.out)}` scores it"
+    print_answer(args, text, agent=args.out, sha256=agent.sha256, task=agent.task)
     return 0
 
 

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.tasks.recordable import Preprocessing
+from dreamfleet.worker.worlds.bilinear import shrink
 
 Pixels = NDArray[np.uint8]
 SCENE_ROWS = 84
 SMALL = 64
-TAP_BITS = 22  # of the fraction in Pillow's weights for 8-bit pictures
 
 
 def _row_weights() -> NDArray[np.float32]:
@@ -43,36 +43,8 @@ def _box(observation: Pixels) -> Pixels:  # native/box.c and standalone_drive.py
     return ((sums + 31) // 63).astype(np.uint8).reshape(SMALL, SMALL, 3)
 
 
-def _pillow_taps(size: int, small: int) -> NDArray[np.float64]:
-    """`(small, size)`: the weights of Pillow's bilinear filter, as whole numbers of `2**-TAP_BITS`.
-
-    A triangle as wide as the step between output pixels reaches to each side of an output pixel's middle.
-    """
-    step = size / small
-    taps = np.zeros((small, size))
-    for pixel in range(small):
-        middle = (pixel + 0.5) * step
-        first, last = max(int(middle - step + 0.5), 0), min(int(middle + step + 0.5), size)
-        weights = [max(0.0, 1 - abs((source - middle + 0.5) / step)) for source in range(first, last)]
-        total = sum(weights)
-        taps[pixel, first:last] = [int(weight / total * 2**TAP_BITS + 0.5) for weight in weights]
-    return taps
-
-
-_TAPS = _pillow_taps(96, SMALL)
-
-
-def _shrink_rows(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shrink the first axis of `(96, n)` to 64 rows of whole numbers, rounded."""
-    # Every sum is an integer below 2**53, so float64 is exact and BLAS may add in any order.
-    rounded: NDArray[np.float64] = np.floor((_TAPS @ pixels + 2 ** (TAP_BITS - 1)) / 2**TAP_BITS)
-    return rounded
-
-
 def _whole(observation: Pixels) -> Pixels:
-    columns = observation.transpose(1, 0, 2).reshape(96, 96 * 3).astype(np.float64)
-    narrow = _shrink_rows(columns).reshape(SMALL, 96, 3).transpose(1, 0, 2)  # Pillow's horizontal pass is its first
-    return _shrink_rows(narrow.reshape(96, SMALL * 3)).astype(np.uint8).reshape(SMALL, SMALL, 3)
+    return shrink(observation, SMALL)
 
 
 def _raw(observation: Pixels) -> Pixels:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -24,13 +24,9 @@ from dreamfleet.worker.tasks.registry import preprocessing_for
 from dreamfleet.worker.worldmodel.policy import ModelPolicy
 from dreamfleet.worker.worlds.car_racing.drivers import DRIVERS, PushedDriver, UniformDriver
 from dreamfleet.worker.worlds.car_racing.native_check import CHECK_INTERVAL, make_car_racing, native_is_exact
-from dreamfleet.worker.worlds.car_racing.preprocessing import BOX, PREPROCESSINGS
+from dreamfleet.worker.worlds.car_racing.preprocessing import BOX, PREPROCESSINGS, find_preprocessing
 from dreamfleet.worker.worlds.car_racing.random_network import RandomNetworkPolicy
 from dreamfleet.worker.worlds.car_racing.true_state import read_true_state
-
-if TYPE_CHECKING:
-    from dreamfleet.worker.worlds.car_racing.agents import NetworkAgent
-    from dreamfleet.worker.worlds.trained_agent import TrainedAgent
 
 ENVIRONMENT = "CarRacing-v3"
 WORLD = World(
@@ -69,6 +65,7 @@ class CarRacingTask(Task):
     drivers: Mapping[str, Callable[[np.random.Generator], Driver]] = DRIVERS
     policies = POLICIES
     preprocessings: Mapping[str, Preprocessing] = PREPROCESSINGS
+    agent_world, agent_options, agent_pictures = WORLD, "", PREPROCESSINGS
 
     def world_of(self, assignment: Assignment) -> World:
         """The world with the actions and costs of the run's variant."""
@@ -119,11 +116,9 @@ class CarRacingTask(Task):
         """The simulator's state of car and road; `true_state` documents units and signs."""
         return read_true_state(environment.unwrapped)
 
-    def make_trained_agent(self, trained: TrainedAgent) -> NetworkAgent:
-        """The agent of a baseline's file; `ControllerError` if it cannot drive CarRacing."""
-        from dreamfleet.worker.worlds.car_racing.agents import NetworkAgent  # it imports this module
-
-        return NetworkAgent(trained)
+    def make_agent_environment(self, preprocessing: str, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
+        """The environment that a trained agent's scores come from, observing the pictures of this name."""
+        return make_judging_environment(find_preprocessing(preprocessing), render_mode)
 
     def make_scene(self, steps: int) -> CarRacingScene:
         """The track on a screen, for a person who drives."""

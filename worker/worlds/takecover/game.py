@@ -16,6 +16,7 @@ from dreamfleet.common.runs.seeds import fold_seed
 from dreamfleet.worker.worlds.takecover.process import start_game
 
 HEIGHT, WIDTH = 120, 160  # of the game's picture
+SCREEN = 480, 640  # height and width of what a person sees
 TICS_PER_SECOND = 35
 LIMIT = 2100  # tics of an episode at most: a minute
 SKILL = 4  # the one to which published scores fit
@@ -31,6 +32,8 @@ Floats = NDArray[np.float32]
 class TakeCover(gymnasium.Env[Pixels, int]):
     """Observes uint8 `(120, 160, 3)`; an action stays, goes left or goes right for `tics` tics; +1 for each tic lived.
 
+    With `screen` it observes what a person sees, `(480, 640, 3)`: the status bar too, and red after a hit.
+
     `terminated` is a death, `truncated` the limit of 2,100 tics. The picture after a death is the one before it: the
     game itself shows a black one. Equal seeds and actions give equal bits, whatever was played before. A seed of more
     than 31 bits is folded. The game's process starts with the first reset, and again after it crashed.
@@ -44,17 +47,19 @@ class TakeCover(gymnasium.Env[Pixels, int]):
     render_mode = "rgb_array"
     drawn_by = "vizdoom"
 
-    def __init__(self, tics: int = 1) -> None:
+    def __init__(self, tics: int = 1, *, screen: bool = False) -> None:
         try:
             import vizdoom
         except ModuleNotFoundError as error:
             remedy = install_command_for("vizdoom")
             raise UsageError(f"Take Cover needs the package vizdoom, which is not here: {remedy}") from error
         self._vizdoom: Any = vizdoom
-        self._tics = tics
+        self._tics, self._screen = tics, screen
         self._game: Any = None
         self._lived = 0
-        self._picture: Pixels = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        self._picture: Pixels = np.zeros((*(SCREEN if screen else (HEIGHT, WIDTH)), 3), np.uint8)
+        if screen:
+            self.observation_space = spaces.Box(0, 255, self._picture.shape, np.uint8)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None  # noqa: ARG002 - there are none
@@ -78,7 +83,7 @@ class TakeCover(gymnasium.Env[Pixels, int]):
         return self._observe(), reward, died, not died and self._lived >= LIMIT, {}
 
     def render(self) -> Any:
-        """The last picture, uint8 `(120, 160, 3)`."""
+        """The last picture."""
         return self._picture
 
     def close(self) -> None:
@@ -99,9 +104,11 @@ class TakeCover(gymnasium.Env[Pixels, int]):
         game.set_doom_skill(SKILL)
         game.set_living_reward(1)
         game.set_window_visible(False)
-        game.set_screen_resolution(vizdoom.ScreenResolution.RES_160X120)
+        sizes = vizdoom.ScreenResolution
+        game.set_screen_resolution(sizes.RES_640X480 if self._screen else sizes.RES_160X120)
         game.set_screen_format(vizdoom.ScreenFormat.RGB24)
-        game.set_render_hud(False)
+        game.set_render_hud(self._screen)
+        game.set_render_screen_flashes(self._screen)  # red after a hit
         start_game(game, Path(vizdoom.__file__).with_name("vizdoom"))
         return game
 

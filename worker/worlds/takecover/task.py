@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -19,6 +20,7 @@ from dreamfleet.worker.tasks.pictures import CropAndResize, VectorActions
 from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.tasks.registry import preprocessing_for
 from dreamfleet.worker.worldmodel.policy import ModelPolicy
+from dreamfleet.worker.worlds.bilinear import shrink
 from dreamfleet.worker.worlds.takecover.game import BAND, LEFT, RIGHT, STAY, TakeCover, observe_band
 from dreamfleet.worker.worlds.takecover.masking import MaskedTakeCover
 from dreamfleet.worker.worlds.takecover.options import TakeCoverOptions
@@ -26,6 +28,8 @@ from dreamfleet.worker.worlds.takecover.options import TakeCoverOptions
 PACKAGES = ("numpy", "onnxruntime", "vizdoom")
 SOLVED = 750.0  # tics, the mean of 100 episodes: OpenAI Gym's DoomTakeCover-v0
 CHOICES, THIRDS = one_hot(3), Continuous.between([-1], [1])
+AGENTS = TakeCoverOptions(tics=1)  # of trained agents, which decide at every tic or hold a choice themselves
+WHOLE = Preprocessing("screen-96", 96, partial(shrink, size=96), mirrors=False)  # named in worker/addons/importing/
 
 
 def cut_in_thirds(action: NDArray[np.float32]) -> int:
@@ -72,6 +76,8 @@ class TakeCoverTask(Task):
 
     name = "takecover"
     world = make_world(TakeCoverOptions())
+    agent_world, agent_options = make_world(AGENTS), AGENTS.text
+    agent_pictures: Mapping[str, Preprocessing] = {WHOLE.name: WHOLE}
 
     def __init__(self, options: TakeCoverOptions | None = None) -> None:
         self._options = options or TakeCoverOptions()
@@ -122,6 +128,15 @@ class TakeCoverTask(Task):
     ) -> gymnasium.Env[Any, Any]:  # fmt: skip
         """The same: a score is in tics of the game, and to draw it costs nothing."""
         return self.make_environment(assignment)
+
+    def make_agent_environment(
+        self, preprocessing: str, render_mode: str | None = None  # noqa: ARG002 - the game always draws
+    ) -> gymnasium.Env[Any, Any]:  # fmt: skip
+        """The same game as a trained agent sees it: the whole screen in the preprocessing of this name."""
+        seen = self.agent_pictures[preprocessing]
+        space = spaces.Box(0, 255, seen.shape, np.uint8)
+        game = TransformObservation(TakeCover(AGENTS.tics, screen=True), seen.picture, space)
+        return VectorActions(game, CHOICES, pick_choice)
 
     def make_watched_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
         """Another of the same, whose `render` gives the game's own picture."""

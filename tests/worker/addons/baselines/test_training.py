@@ -1,6 +1,6 @@
 """The network learns in the real CarRacing; an interrupted training resumes to the same bits; its export drives alike.
 Tests export.py, presets.py, progress.py, train.py, verb.py, worker/worlds/trained_agent.py and
-worker/worlds/car_racing/agents.py."""
+worker/worlds/network_agent.py."""
 
 import hashlib
 import json
@@ -36,8 +36,8 @@ from dreamfleet.worker.training.checkpoint import load_config, load_progress, lo
 from dreamfleet.worker.worldmodel.inference import open_graph
 from dreamfleet.worker.worldmodel.vae import VAE
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
-from dreamfleet.worker.worlds.car_racing.agents import NetworkPolicy
 from dreamfleet.worker.worlds.car_racing.native_check import make_car_racing
+from dreamfleet.worker.worlds.network_agent import NetworkPolicy
 from dreamfleet.worker.worlds.trained_agent import MANIFEST, NETWORK, TrainedAgent
 from tests.support.disks import file_size_limit
 from tests.support.verbs import run_verb
