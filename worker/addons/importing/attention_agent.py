@@ -15,12 +15,15 @@ from dreamfleet.common.artifacts.actions import one_hot
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.files.archives import read_arrays
 from dreamfleet.common.host.packages import package_version
+from dreamfleet.common.worlds.shipped import WORLDS
 from dreamfleet.worker.addons.importing.sources import AGENT_ARRAY, AGENT_LIMITS
+from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worldmodel.mdnrnn_graph import lstm
 from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
 from dreamfleet.worker.worlds.trained_agent import AgentManifest, TrainedAgent
 
 SOURCE = "google/brain-tokyo-workshop, AttentionAgent"
+PICTURES = "screen-96"  # which only that task has
 SIDE, PATCH, STRIDE, CHOSEN = 96, 7, 4, 10
 UNITS = 16
 PLACES = (SIDE - PATCH) // STRIDE + 1  # of patches in a row or a column
@@ -43,8 +46,9 @@ class _Graph(GraphBuilder):
 
 def import_attention_agent(path: Path) -> TrainedAgent:
     """The agent of a file; `DatasetError` for another number of parameters."""
+    shown = (name for name in WORLDS if PICTURES in getattr(find_task(name), "agent_pictures", {}))
     manifest = AgentManifest(
-        name="attention-agent", task="takecover", preprocessing="screen-96", choices=one_hot(3).choices, frame_skip=1,
+        name="attention-agent", task=next(shown), preprocessing=PICTURES, choices=one_hot(3).choices, frame_skip=1,
         state=2 * UNITS, provenance={"imported": SOURCE, "versions": {"dreamfleet": package_version("dreamfleet")}},
     )  # fmt: skip
     return TrainedAgent(manifest, export_network(_read_weights(path)))
@@ -55,7 +59,7 @@ def _read_weights(path: Path) -> Weights:
         numbers = read_arrays(path, AGENT_LIMITS, (AGENT_ARRAY,))[AGENT_ARRAY]
         ends = np.cumsum([np.prod(shape) for shape in SHAPES.values()])
         if numbers.shape != (ends[-1],) or numbers.dtype.kind != "f":
-            raise ValueError(f"{numbers.dtype} of shape {numbers.shape}, and Take Cover's are {ends[-1]} floats")
+            raise ValueError(f"{numbers.dtype} of shape {numbers.shape}, and an agent has {ends[-1]} floats")
         numbers = numbers.astype(np.float32)
         if not np.isfinite(numbers).all():
             raise ValueError("NaN, infinity, or numbers beyond single precision")

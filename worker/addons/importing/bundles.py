@@ -1,6 +1,8 @@
-"""World models of hardmaru/WorldModelsExperiments, carracing, and of ctallec/world-models, as bundles."""
+"""World models of hardmaru/WorldModelsExperiments and of ctallec/world-models, as bundles."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,21 +10,35 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.bundle import Bundle, write_bundle
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.host.packages import package_version
+from dreamfleet.common.worlds.shipped import WORLDS
 from dreamfleet.worker.addons.importing import checkpoints
-from dreamfleet.worker.addons.importing.json_weights import Weights, read_initial_latents, read_mdnrnn, read_vae
+from dreamfleet.worker.addons.importing.json_weights import (
+    ENDING_RNN,
+    Weights,
+    read_initial_latents,
+    read_mdnrnn,
+    read_vae,
+)
 from dreamfleet.worker.addons.importing.sources import MDRNN, PLACES, VAE, find_checkpoint, find_json
-from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD
+from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld
 from dreamfleet.worker.tasks.recordable import Preprocessing
+from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.training.assemble import export_graphs, make_manifest  # needs the extra `train`
 from dreamfleet.worker.training.data.data_folder import explain_write_errors
 from dreamfleet.worker.training.data.dataset import find_world
 from dreamfleet.worker.training.dream_facts import NO_DRIVES, describe_world
-from dreamfleet.worker.worldmodel.mdnrnn_config import PAPER as PAPER_RNN
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
-from dreamfleet.worker.worldmodel.vae_config import PAPER as PAPER_VAE
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 
 WME = "hardmaru/WorldModelsExperiments"
+ENDS_AT = "0.5"  # probability, in WME's dreams that end
+
+
+@runtime_checkable
+class TaskOfWME(Protocol):
+    """Optional: a task in whose world that project has a program besides the first world's."""
+
+    wme_options: str  # under which its world is as there
 
 
 def import_json_model(folder: Path, out: Path) -> Bundle:
@@ -35,10 +51,18 @@ def import_json_model(folder: Path, out: Path) -> Bundle:
     if missing:
         raise DatasetError(f"{folder} lacks {' and '.join(missing)} (also looked for in vae/ and rnn/)")
     paths = {name: found for name in PLACES if (found := find_json(folder, name)) is not None}
-    vae, rnn = read_vae(paths["vae.json"]), read_mdnrnn(paths["rnn.json"])
-    first = paths.get("initial_z.json")
-    initial = np.zeros((1, 2, PAPER_VAE.latent), np.float32) if first is None else read_initial_latents(first)
-    return _write(out, WME, (vae, PAPER_VAE), (rnn, PAPER_RNN), initial)
+    rnn, layers = read_mdnrnn(paths["rnn.json"])
+    config = VAEConfig(latent=layers.latent)
+    vae, first = read_vae(paths["vae.json"], config), paths.get("initial_z.json")
+    initial = read_initial_latents(first, config.latent) if first else np.zeros((1, 2, config.latent), np.float32)
+    world = _find_ending_world() if layers == ENDING_RNN else OF_FIRST_WORLD
+    return _write(out, WME, (vae, config), (rnn, layers), initial, world=world)
+
+
+def _find_ending_world() -> DataWorld:
+    """The world of WME's doomrnn, which says itself that it is: its name stands only in its room."""
+    tasks = {name: find_task(name) for name in WORLDS}
+    return next(DataWorld(name, task.wme_options) for name, task in tasks.items() if isinstance(task, TaskOfWME))
 
 
 def import_checkpoints(folder: Path, out: Path) -> Bundle:
@@ -59,10 +83,12 @@ def import_checkpoints(folder: Path, out: Path) -> Bundle:
 
 def _write(
     out: Path, source: str, vae: tuple[Weights, VAEConfig], rnn: tuple[Weights, MDNRNNConfig],
-    initial: NDArray[np.float32], pictures: Preprocessing | None = None,
+    initial: NDArray[np.float32], pictures: Preprocessing | None = None, world: DataWorld = OF_FIRST_WORLD,
 ) -> Bundle:  # fmt: skip
     provenance = {"imported": source, "versions": {"dreamfleet": package_version("dreamfleet")}}
-    facts = describe_world(OF_FIRST_WORLD, NO_DRIVES, rnn[1])
-    manifest = make_manifest(out.stem, provenance, facts, vae[1], rnn[1], preprocessing=pictures)
+    facts = describe_world(world, NO_DRIVES, rnn[1], end=ENDS_AT if rnn[1] == ENDING_RNN else None)
+    manifest = make_manifest(out.stem, provenance, facts, vae[1], rnn[1], world, pictures)
+    if rnn[1] == ENDING_RNN:  # controllers see the cells too, which follow the hidden state
+        manifest = replace(manifest, hidden=2 * manifest.hidden)
     with explain_write_errors(out):
-        return write_bundle(out, manifest, export_graphs(vae[0], rnn[0], initial, vae[1], rnn[1]))
+        return write_bundle(out, manifest, export_graphs(vae[0], rnn[0], initial, vae[1], rnn[1], world))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import ControllerShape
 from dreamfleet.common.errors import ControllerError, DatasetError
 from dreamfleet.common.files.archives import parse_array
@@ -68,6 +69,23 @@ def to_parameters(vector: NDArray[Any], layout: str, shape: ControllerShape) -> 
     count = shape.actions
     biases, weights = (vector[:count], vector[count:]) if layout == "wme" else (vector[-count:], vector[:-count])
     return np.concatenate([weights.reshape(shape.features, count).T.ravel(), biases])
+
+
+def sees_cells(bundle: Bundle) -> bool:
+    """Whether a bundle's controllers see the LSTM's cells too, as those of WME's Doom do."""
+    return bundle.manifest.hidden == 2 * bundle.manifest.models.get("mdnrnn", {}).get("hidden", 0)
+
+
+def with_units(vector: NDArray[np.float64], bundle: Bundle) -> NDArray[np.float64]:
+    """A vector of WME's Doom as one of the layout `wme` for its bundle; `ControllerError` for another size.
+
+    It weights latent, cells and hidden state, without a bias. A bundle has the cells last, and a unit more of each.
+    """
+    latent, units = bundle.manifest.latent, bundle.manifest.hidden // 2 - 1
+    if len(vector) != latent + 2 * units:
+        raise ControllerError(f"it has {len(vector)} numbers, and a controller of {bundle.path} {latent + 2 * units}")
+    seen, cells, hidden = np.split(vector, [latent, latent + units])
+    return np.concatenate([[0], seen, hidden, [0], cells, [0]])
 
 
 def _from_json(path: Path) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""`dreamfleet import`: controllers, world models and drives of other projects."""
+"""`dreamfleet import`: controllers, world models, agents and drives of other projects."""
 
 from __future__ import annotations
 
@@ -33,11 +33,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source", type=Path, metavar="SOURCE",
         help="a world model, a folder with vae.json and rnn.json or with vae/best.tar and mdrnn/best.tar. Drives: .npz "
-        "or a folder of them. A controller: ctrl/best.tar, .json, .npy, .csv, .txt, or a folder that pycma wrote",
+        "or a folder of them. A controller: ctrl/best.tar, .json, .npy, .csv, .txt, or a folder that pycma wrote. An "
+        "agent: AttentionAgent's model.npz",
     )  # fmt: skip
     parser.add_argument(
         "--out", type=Path, required=True,
-        help="the bundle NAME.zip, the data folder, or the controller NAME.npz to write",
+        help="the bundle or agent NAME.zip, the data folder, or the controller NAME.npz to write",
     )  # fmt: skip
     parser.add_argument(
         "--layout", choices=LAYOUTS,
@@ -137,7 +138,7 @@ def _read_controller(args: argparse.Namespace) -> Controller:
     from dreamfleet.common.artifacts.bundle_store import find_bundle
     from dreamfleet.common.artifacts.controller import IMPORTED, Controller
     from dreamfleet.common.artifacts.driving import FIRST_WORLD
-    from dreamfleet.worker.addons.importing.vectors import to_parameters
+    from dreamfleet.worker.addons.importing.vectors import sees_cells, to_parameters, with_units
 
     checkpoint = sources.checkpoint_of(args.source)
     if checkpoint is not None and args.layout not in (None, "ctallec"):
@@ -162,6 +163,8 @@ def _read_controller(args: argparse.Namespace) -> Controller:
     options = OPTIONS.get(layout, "") if bundle.manifest.task == FIRST_WORLD else ""
     driving = bundle.driving_of(options)
     shape = bundle.shape_of("zh", driving=driving)
+    if layout == "wme" and sees_cells(bundle):
+        vector = with_units(vector, bundle)
     return Controller(
         shape, to_parameters(vector, layout, shape), bundle.manifest.task, bundle.sha256, provenance, options,
         driving.version,

@@ -29,6 +29,8 @@ PACKAGES = ("numpy", "onnxruntime", "vizdoom")
 SOLVED = 750.0  # tics, the mean of 100 episodes: OpenAI Gym's DoomTakeCover-v0
 CHOICES, THIRDS = one_hot(3), Continuous.between([-1], [1])
 AGENTS = TakeCoverOptions(tics=1)  # of trained agents, which decide at every tic or hold a choice themselves
+# Of the game's whole picture, rows 10 to 109 are what is above the status bar on its screen.
+WME = TakeCoverOptions(tics=1, actions="thirds", crop="10:110,0:160")
 WHOLE = Preprocessing("screen-96", 96, partial(shrink, size=96), mirrors=False)  # named in worker/addons/importing/
 
 
@@ -76,6 +78,7 @@ class TakeCoverTask(Task):
 
     name = "takecover"
     world = make_world(TakeCoverOptions())
+    wme_options = WME.text  # read by worker/addons/importing/
     agent_world, agent_options = make_world(AGENTS), AGENTS.text
     agent_pictures: Mapping[str, Preprocessing] = {WHOLE.name: WHOLE}
 

@@ -13,11 +13,11 @@ import numpy as np
 
 SHARED = tuple(Path("/dev/shm", name) for name in ("ViZDoomSM", "ViZDoomMQCtr", "ViZDoomMQDoom"))
 scenarios_path = str(Path(__file__).parent)
-ScreenResolution = SimpleNamespace(RES_160X120=(120, 160))
+ScreenResolution = SimpleNamespace(RES_160X120=(120, 160), RES_640X480=(480, 640))
 ScreenFormat = SimpleNamespace(RGB24="RGB24")
 SET = {
-    "set_doom_skill": 4, "set_living_reward": 1, "set_window_visible": False, "set_render_hud": False,
-    "set_screen_resolution": ScreenResolution.RES_160X120, "set_screen_format": ScreenFormat.RGB24,
+    "set_doom_skill": [4], "set_living_reward": [1], "set_window_visible": [False], "set_render_hud": [False, True],
+    "set_screen_format": [ScreenFormat.RGB24], "set_render_screen_flashes": [False, True],
 }  # fmt: skip
 
 
@@ -36,9 +36,12 @@ class DoomGame:
         expected = SET[name]
 
         def check(value):
-            assert value == expected
+            assert value in expected
 
         return check
+
+    def set_screen_resolution(self, size):
+        self._size = size
 
     def set_vizdoom_path(self, path):
         self._path = path
@@ -72,7 +75,7 @@ class DoomGame:
         if self.is_episode_finished():
             return None
         random = np.random.default_rng([self._seed, self._tic, self._moves])
-        return SimpleNamespace(screen_buffer=random.integers(0, 256, (120, 160, 3), dtype=np.uint8))
+        return SimpleNamespace(screen_buffer=random.integers(0, 256, (*self._size, 3), dtype=np.uint8))
 
     def make_action(self, buttons, tics):
         if not self.is_running():

@@ -1,13 +1,12 @@
 """Files of `torch.save` are read as data; hostile ones are refused, and nothing in them is executed.
 Also world models and controllers in the exact layout of hardmaru/WorldModelsExperiments, carracing.
-Tests bundles.py and json_weights.py."""
+Tests json_weights.py."""
 
 import json
 import os
 import pickle
 import struct
 import zipfile
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -20,7 +19,9 @@ from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.worker.addons.importing.checkpoints import array_of, read_torch_file
 from dreamfleet.worker.addons.importing.json_weights import read_mdnrnn, read_vae
-from tests.support.checkpoint_files import ACTIONS, CHANNELS, HIDDEN, LATENT, MIXTURES, sigmoid
+from dreamfleet.worker.worldmodel.vae_config import PAPER
+from tests.support.checkpoint_files import ACTIONS, HIDDEN, LATENT, MIXTURES, sigmoid
+from tests.support.wme_files import encode, vae_of, whole_numbers
 
 LEGACY = [False, True]
 
@@ -177,26 +178,12 @@ def test_only_regular_files_of_a_bounded_size_are_read(tmp_path):
             read_torch_file(tmp_path / name)
 
 
-def whole_numbers(random, *shape, scale):
-    return np.round(random.normal(0, scale, shape) * 10_000).astype(int)
-
-
 @pytest.fixture(scope="module")
 def theirs(tmp_path_factory):
     """A folder as theirs, of random weights, and the numbers in it."""
     random = np.random.default_rng(1)
     folder = tmp_path_factory.mktemp("carracing")
-    down = [((4, 4, *channels), channels[1], (16 * channels[0]) ** -0.5) for channels in pairwise(CHANNELS)]
-    up = [((5, 5, 128, 1024), 128), ((5, 5, 64, 128), 64), ((6, 6, 32, 64), 32), ((6, 6, 3, 32), 3)]
-    layers = [
-        *down, *[((1024, LATENT), LATENT, 1024**-0.5)] * 2, ((LATENT, 1024), 1024, 0.2),
-        *((weights, biases, weights[-1] ** -0.5) for weights, biases in up),
-    ]  # fmt: skip
-    vae = [
-        whole_numbers(random, *shape, scale=each)
-        for weights, biases, scale in layers
-        for shape, each in ((weights, scale), ((biases,), 0.1))
-    ]
+    vae = vae_of(random, LATENT)
     rnn = [
         whole_numbers(random, HIDDEN, 3 * MIXTURES * LATENT, scale=0.05),
         whole_numbers(random, 3 * MIXTURES * LATENT, scale=0.1),
@@ -220,14 +207,7 @@ def drive_of_theirs(vae, rnn, controller, pictures):
     heads, _, kernel, bias = rnn
     cell, hidden, actions = np.zeros(HIDDEN), np.zeros(HIDDEN), []
     for picture in pictures:
-        value = (picture - 1.0) / 255  # their pictures are CarRacing's minus 1
-        for layer in range(4):
-            weight, offset = vae[2 * layer], vae[2 * layer + 1]
-            side = (value.shape[0] - 4) // 2 + 1
-            corners = [(2 * row, 2 * column) for row in range(side) for column in range(side)]
-            patches = np.stack([value[row : row + 4, column : column + 4] for row, column in corners])
-            value = np.maximum(np.tensordot(patches, weight, 3) + offset, 0).reshape(side, side, -1)
-        latent = value.ravel() @ vae[8] + vae[9]
+        latent = encode(vae, picture)
         logits = np.concatenate([latent, hidden]) @ controller[3:].reshape(-1, 3) + controller[:3]
         action = np.tanh(logits)
         action = np.array([action[0], (action[1] + 1) / 2, np.clip(action[2], 0, 1)])
@@ -264,7 +244,7 @@ def test_a_controller_acts_as_in_their_program(theirs, bundle, tmp_path):
 
 def test_heads_are_in_our_order(theirs):
     folder, _, rnn, _ = theirs
-    weights = read_mdnrnn(folder / "rnn" / "rnn.json")
+    weights, _ = read_mdnrnn(folder / "rnn" / "rnn.json")
     latent, kind, mixture = 17, 2, 3  # theirs: 15 numbers a latent: log weights, means, log deviations
     theirs_column = latent * 3 * MIXTURES + kind * MIXTURES + mixture
     ours_row = kind * LATENT * MIXTURES + latent * MIXTURES + mixture
@@ -299,4 +279,4 @@ def test_weights_that_are_not_finite_are_refused(theirs, tmp_path):
     text = json.dumps([each.tolist() for each in vae]).replace(str(vae[1].tolist()[0]), "1e400", 1)
     (tmp_path / "vae.json").write_text(text)
     with pytest.raises(DatasetError):
-        read_vae(tmp_path / "vae.json")
+        read_vae(tmp_path / "vae.json", PAPER)
