@@ -16,6 +16,7 @@ from dreamfleet.worker.addons.importing.json_weights import read_mdnrnn
 from dreamfleet.worker.tasks.registry import find_world
 from dreamfleet.worker.worldmodel.inference import DreamStep
 from tests.support.checkpoint_files import sigmoid
+from tests.support.doom import use_fake
 from tests.support.wme_files import LATENT, MIXTURES, UNITS, Memory, drive, write_doomrnn
 
 BEST = "log/doomrnn.cma.16.64.best.json"
@@ -62,6 +63,15 @@ def test_a_controller_acts_as_in_their_program(theirs, bundle, tmp_path):
     assert np.abs(np.array(actions) - wanted).max() < 1e-5
     assert np.ptp(wanted) > 0.1  # it is not saturated
     assert np.abs(wanted).max() < 0.99
+
+
+def test_evaluate_plays_a_controller_in_the_game(theirs, bundle, tmp_path, monkeypatch):
+    use_fake(monkeypatch)
+    out, report = tmp_path / "best.npz", tmp_path / "report.json"
+    assert main(["import", str(theirs[0] / BEST), "--bundle", str(bundle.path), "--out", str(out)]) == 0
+    words = ["--controller", str(out), "--bundle", str(bundle.path), "--episodes", "1", "--jobs", "1"]
+    assert main(["evaluate", *words, "--out", str(report)]) == 0
+    assert json.loads(report.read_text())["drives"][0]["score"] >= 40  # the stand-in's shortest game
 
 
 def test_dreams_are_theirs_and_the_first_step_is_another(theirs, bundle):
