@@ -73,7 +73,8 @@ def to_parameters(vector: NDArray[Any], layout: str, shape: ControllerShape) -> 
 
 def sees_cells(bundle: Bundle) -> bool:
     """Whether a bundle's controllers see the LSTM's cells too, as those of WME's Doom do."""
-    return bundle.manifest.hidden == 2 * bundle.manifest.models.get("mdnrnn", {}).get("hidden", 0)
+    units: int = bundle.manifest.models.get("mdnrnn", {}).get("hidden", 0)
+    return bundle.manifest.hidden == 2 * units
 
 
 def with_units(vector: NDArray[np.float64], bundle: Bundle) -> NDArray[np.float64]:

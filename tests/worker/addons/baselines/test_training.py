@@ -282,7 +282,7 @@ def file(trained, tmp_path):
 def test_it_chooses_what_the_network_chooses_all_episode_long(layers, tmp_path):
     networks = networks_of(layers, 1)
     agent = make_agent(export_agent(keep(tmp_path, networks)))
-    environment = make_car_racing(preprocessing=agent.preprocessing)
+    environment = make_car_racing(preprocessing=agent.trained.manifest.preprocessing)
     torchs, exported = QPolicy(networks.online), agent.make_policies()(SEED)
     chosen = []
     for each in (torchs, exported):
