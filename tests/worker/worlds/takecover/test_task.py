@@ -55,6 +55,19 @@ def pictures_of(tics, actions, seed=3):
     return pictures, total, tuple(ends)
 
 
+def test_the_whole_screen_shows_the_same_game(doom):
+    small, large = TakeCover(), TakeCover(screen=True)
+    assert [game.reset(seed=11)[0].shape for game in (small, large)] == [(120, 160, 3), (480, 640, 3)]
+    random, over = np.random.default_rng(4), False
+    while not over:
+        action = int(random.integers(3))
+        one, other = (game.step(action)[1:4] for game in (small, large))
+        assert one == other
+        over = any(one[1:])
+    small.close()
+    large.close()
+
+
 @pytest.mark.parametrize("options", ["", ALL_CHANGED])
 def test_the_task_keeps_the_contract_of_recordable_worlds_and_its_drivers_follow_the_actions(doom, options):
     task = find_task("takecover").with_options(options)
