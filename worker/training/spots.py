@@ -23,11 +23,22 @@ class Spots(NamedTuple):
     column: Floats
     kept: NDArray[np.bool_]
 
+    def of_size(self, least: int, most: int) -> "Spots":
+        """Those of so many pixels."""
+        among = (self.size >= least) & (self.size <= most)
+        return Spots(self.size[among], self.row[among], self.column[among], self.kept[among])
+
+
+def measure_mean(pictures: Pictures) -> tuple[Floats, float]:
+    """The mean picture `(side, side, 3)` of `(N, side, side, 3)`, and the mean of `|x - mean|`, both in bytes."""
+    mean = pictures.mean(axis=0, dtype=np.float64)
+    return mean, float(np.abs(pictures - mean).mean())
+
 
 def find_spots(pictures: Pictures, decoded: NDArray[Any], mean: Floats, deviation: float) -> Spots:
     """The spots of `pictures` `(N, side, side, 3)`, and which of them `decoded` keeps.
 
-    `mean` `(side, side, 3)` is the mean picture and `deviation` the mean of `|x - mean|`, both in bytes.
+    `mean` and `deviation` are those of `measure_mean`.
     """
     seen, shown = pictures - mean, decoded - mean
     labels = _label(np.abs(seen).mean(axis=3) > DEVIATIONS * deviation)
@@ -48,9 +59,8 @@ def kept_shares(spots: Spots) -> dict[str, float]:
     """The share of the spots of each class that is kept, by name; a class without a spot is left out."""
     shares = {}
     for least, most in SIZES:
-        among = (spots.size >= least) & (spots.size <= most)
-        if among.any():
-            shares[f"kept_of_spots_{least}_to_{most}"] = round(float(spots.kept[among].mean()), 3)
+        if (kept := spots.of_size(least, most).kept).size:
+            shares[f"kept_of_spots_{least}_to_{most}"] = round(float(kept.mean()), 3)
     return shares
 
 

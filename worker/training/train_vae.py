@@ -14,7 +14,7 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.common.host.stop_signals import Stop, never_stop
 from dreamfleet.worker.training.data import dataset
 from dreamfleet.worker.training.presets import TrainConfig
-from dreamfleet.worker.training.spots import find_spots, kept_shares
+from dreamfleet.worker.training.spots import find_spots, kept_shares, measure_mean
 from dreamfleet.worker.training.training_state import AddPoint, TrainingState, open_loss_curve
 from dreamfleet.worker.worldmodel.vae import VAE, PixelWeights
 from dreamfleet.worker.worldmodel.vae_config import PAPER, VAEConfig
@@ -171,7 +171,7 @@ def held_out_pictures(held_out: Sequence[Path], most: int) -> NDArray[np.uint8]:
 def measure_quality(model: VAE, held_out: Sequence[Path], device: torch.device | None = None) -> dict[str, float]:
     """Squared error per picture of reconstructions and of the mean picture, active latents, and spots that are kept."""
     pictures = held_out_pictures(held_out, VALIDATION_PICTURES)
-    mean = pictures.mean(axis=0, dtype=np.float64) / 255
+    mean, deviation = measure_mean(pictures)
     errors, baseline, nats, shown = [], [], [], []
     model.eval()
     with torch.no_grad():
@@ -181,11 +181,10 @@ def measure_quality(model: VAE, held_out: Sequence[Path], device: torch.device |
             decoded = model.decode(mu)
             errors.append((decoded - batch).square().sum(dim=(1, 2, 3)).cpu().numpy())
             shown.append((255 * decoded).permute(0, 2, 3, 1).cpu().numpy())
-            baseline.append(((pictures[start : start + 100] / 255.0 - mean) ** 2).sum(axis=(1, 2, 3)))
+            baseline.append(((pictures[start : start + 100] / 255.0 - mean / 255) ** 2).sum(axis=(1, 2, 3)))
             nats.append((0.5 * (mu.square() + logvar.exp() - logvar - 1)).cpu().numpy())
     active = (np.concatenate(nats).mean(axis=0) > ACTIVE_NATS).sum()
-    deviation = max(np.abs(pictures - 255 * mean).mean(), 255 * LEAST_DEVIATION)
-    spots = find_spots(pictures, np.concatenate(shown), 255 * mean, deviation)
+    spots = find_spots(pictures, np.concatenate(shown), mean, deviation)
     return {
         "reconstruction_error": round(float(np.concatenate(errors).mean()), 2),
         "mean_picture_error": round(float(np.concatenate(baseline).mean()), 2),

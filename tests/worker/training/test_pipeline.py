@@ -136,6 +136,8 @@ def test_a_share_of_a_preset_becomes_a_bundle_of_its_own_layers(name, tmp_path, 
     answer = json.loads(capsys.readouterr().out)
     assert tuple(answer["stages"]) == STAGES
     bundle, preset = made(tmp_path, name), PRESETS[name]
+    figures = answer["stages"]["train.vae"] | answer["stages"]["train.mdnrnn"]
+    assert figures.items() >= bundle.manifest.provenance["quality"].items()
     assert answer["stages"]["bundle"]["sha256"] == bundle.sha256
     assert bundle.manifest.picture[0] == preset.collect.picture
     assert bundle.manifest.hidden == preset.mdnrnn_layers.hidden

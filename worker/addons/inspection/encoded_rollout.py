@@ -63,9 +63,14 @@ class EncodedRollout:
         return np.argsort(-self.nats, kind="stable")
 
     @property
+    def first_informative_step(self) -> int:
+        """The step after the opening if the drive is long enough, else 0."""
+        return self.opening if len(self) > self.opening else 0
+
+    @property
     def most_informative_step(self) -> int:
-        """The step with the largest KL divergence; after the opening if the drive is long enough."""
-        start = self.opening if len(self) > self.opening else 0
+        """The step with the largest KL divergence, of those of `first_informative_step`."""
+        start = self.first_informative_step
         return start + int(self._divergence[start:].sum(axis=1).argmax())
 
     @property

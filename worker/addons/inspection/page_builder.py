@@ -27,6 +27,7 @@ PAGE = "index.html"
 UNITS = {  # units of the quality figures, by a part of their names, and which values are good
     "picture_error": "summed squared error of the mean picture, which a reconstruction has to beat",
     "reconstruction_error": "summed squared error of a picture: the less, the better",
+    "kept_of_spots": "share of spots of so many pixels, unlike the mean picture, that the decoder shows: 1 is all",
     "nats_per_dimension": "of the next latent: the less, the better",
     "latent_error": "root mean square, in the latents' spread: 0 is exact, 1 as bad as their mean",
     "auc": "0.5 is chance, 1 exact",
@@ -126,12 +127,14 @@ def _vae_sections(data: Sequence[Path], config: DriveConfig) -> Iterator[Section
             yield replace(section, name=f"{section.name}-{number}", title=f"{section.title}: {folder.resolve().name}")
             continue
         yield section
+        yield vae_sections.spots(driven, vae_view)
         yield from _latent_sections(driven, vae_view)
 
 
 def _bundle_sections(bundle: Bundle, subject: InspectionSubject, config: DriveConfig) -> Iterator[Section]:
     driven, vae_view = record_drive(bundle, subject.controller, config, subject.own), VAEView.of_bundle(bundle)
     yield vae_sections.reconstructions(driven, vae_view)
+    yield vae_sections.spots(driven, vae_view)
     yield from _latent_sections(driven, vae_view)
     yield mdnrnn_sections.dream_section(bundle, driven, vae_view)
     heads = bundle.manifest.models.get("mdnrnn", {})

@@ -25,10 +25,13 @@ from dreamfleet.worker.addons.inspection.page import (
     render_png,
 )
 from dreamfleet.worker.tasks.recordable import Preprocessing
+from dreamfleet.worker.training.spots import SIZES, find_spots, measure_mean
 from dreamfleet.worker.worldmodel.inference import Decoder, Encoder, open_graph
 
 SHOWN = 8  # pictures per row, latents per table
 TRAVERSED = np.linspace(-3, 3, 7)
+BANDS = 4  # of rows, and of columns, in each of which spots are counted
+LIGHT = 0.55  # share up to which its colour is light
 NOISE = (-2, -1, 0, 1, 2)  # means of the random latents
 MOST, MOST_BYTES = 8, 50_000_000  # own pictures, bytes of a file
 NAME = 16  # characters of a heading
@@ -100,6 +103,35 @@ def reconstructions(drive: EncodedRollout, vae_view: VAEView) -> Section:
         f"Pictures of {drive.description}, and the decoder's picture of each one's mean latent. "
         f"Summed squared error a picture over all {plural(len(drive), 'step')}: {error:.1f}.",
         picture_grid(rows, [f"step {step}" for step in steps]),
+    )  # fmt: skip
+
+
+def spots(drive: EncodedRollout, vae_view: VAEView) -> Section:
+    """Draw which share of small parts unlike the mean picture is in the decoder's pictures, by size and place."""
+    start = drive.first_informative_step
+    seen = drive.picture[start:]
+    found = find_spots(seen, vae_view.decode(drive.mu[start:]), *measure_mean(seen))
+    figure, axes = new_figure(3.9, 1, len(SIZES))
+    for each, (least, most) in zip(axes[0], SIZES, strict=True):
+        among = found.of_size(least, most)
+        count, kept = (
+            np.histogram2d(among.row, among.column, BANDS, ((0, 1), (0, 1)), weights=weights)[0]
+            for weights in (None, among.kept)
+        )
+        share = np.divide(kept, count, out=np.full_like(kept, np.nan), where=count > 0)
+        mean = f"{kept.sum() / count.sum():.0%} of {plural(int(count.sum()), 'spot')}" if count.any() else "no spots"
+        draw_heatmap(each, share, f"{least} to {most} pixels: {mean}", cmap="Blues", vmin=0, vmax=1)
+        each.set(xticks=[], yticks=[], facecolor="0.9")
+        for row, column in np.argwhere(count):
+            text = f"{share[row, column]:.0%}\nof {count[row, column]:.0f}"
+            colour = "white" if share[row, column] > LIGHT else "black"
+            each.text(column, row, text, ha="center", va="center", fontsize=FONT, color=colour)
+    return Section(
+        "spots", "The small things that it keeps",
+        "Spots are connected pixels far from the drive's mean picture, such as a ball; the decoder has a spot if it "
+        f"shows half of its deviation there. The share that it has, by size, and in {BANDS} x {BANDS} fields of the "
+        "picture. Grey fields have no spot.",
+        render_png(figure),
     )  # fmt: skip
 
 

@@ -33,7 +33,7 @@ SUMMARY = "look into a world model: what it sees, keeps and dreams, and how it l
 EXTRAS = ("worker", "views")
 FIRST = "--out --data --picture --controller --seed --steps --probe --losses --likeness --survival --episodes --json"
 WORDS = ("quantity", "begun", "mean", "policy")  # columns of the figures that are no numbers
-SECTIONS = 12  # at most, and one more a data folder
+SECTIONS = 13  # at most, and one more a data folder
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

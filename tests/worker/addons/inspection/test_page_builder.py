@@ -65,7 +65,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 VAE = VAEConfig(latent=5, channels=(4, 4, 4, 8))
 ATTENTIVE = MDNRNNConfig(latent=5, hidden=8, mixtures=2, window=3, attention_units=4)
 SHORT = DriveConfig(steps=12)
-LOOKS = ["reconstructions", "traversals", "latents", "samples"]
+LOOKS = ["reconstructions", "spots", "traversals", "latents", "samples"]
 
 
 class Links(HTMLParser):
@@ -115,6 +115,18 @@ def test_a_page_has_every_section_and_needs_nothing_else(attentive, tmp_path):
         assert (page.parent / f"{name}.png").read_bytes().startswith(PNG)
 
 
+def test_spots_are_counted_where_they_lie_and_kept_where_the_decoder_has_them(monkeypatch):
+    seen = np.random.default_rng(0).integers(20, 60, (12, 64, 64, 3), np.uint8)
+    decoded, latents, drawn = seen.copy(), np.zeros((12, 5), np.float32), []
+    seen[0, 5:8, 5:8] = seen[1, 50:56, 50:56] = decoded[1, 50:56, 50:56] = 240
+    view = VAEView(64, 5, lambda _pictures: (latents, latents), lambda _latents: decoded)
+    drive = encoded_rollout.EncodedRollout(seen, latents, latents, latents, np.zeros(12), "")
+    monkeypatch.setattr(vae_sections, "render_png", drawn.append)
+    vae_sections.spots(drive, view)
+    fields = [(text.get_position(), text.get_text()) for each in drawn[0].axes[:2] for text in each.texts]
+    assert fields == [((0, 0), "0%\nof 1"), ((3, 3), "100%\nof 1")]
+
+
 @pytest.mark.slow
 def test_what_a_bundle_cannot_do_is_left_out_and_a_drive_is_seen_as_it_sees(tmp_path):
     whole = VAEConfig(picture=96, padding="same", latent=5, channels=(2, 2, 2, 2))
@@ -126,9 +138,12 @@ def test_what_a_bundle_cannot_do_is_left_out_and_a_drive_is_seen_as_it_sees(tmp_
 
 
 def test_the_table_has_sizes_and_quality(attentive):
-    attentive.manifest.provenance.update({"quality": {"reward_auc": 0.9}, "held_out_episodes": 7})
+    attentive.manifest.provenance.update(
+        {"quality": {"reward_auc": 0.9, "kept_of_spots_5_to_16": 0.4}, "held_out_episodes": 7}
+    )
     rows = dict(manifest_facts(attentive))
     assert rows["quality: reward auc"] == "0.9 (0.5 is chance, 1 exact)"
+    assert rows["quality: kept of spots 5 to 16"].startswith("0.4 (")
     assert (rows["latents"], rows["attention window"], rows["held out episodes"]) == ("5", "3", "7")
 
 
@@ -308,7 +323,7 @@ def write_picture(path, height, width):
 @pytest.mark.slow
 def test_a_vae_alone_shows_what_it_keeps_of_a_held_out_drive_beside_how_it_learnt(trained, tmp_path):
     page = page_of([trained], tmp_path)
-    assert sections(page) == ["reconstructions", "traversals", "latents", "samples", "loss-vae", "loss-mdnrnn"]
+    assert sections(page) == ["reconstructions", "spots", "traversals", "latents", "samples", "loss-vae", "loss-mdnrnn"]
     assert "00000" in page.read_text()
     drive = held_out_drive(trained, VAEView.of_folder(trained), DriveConfig(steps=8))
     assert len(drive) == len(drive.mu) == 8
