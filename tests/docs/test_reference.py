@@ -9,12 +9,12 @@ import pytest
 
 import dreamfleet
 from deploy import reference
+from dreamfleet.common.addons.evaluation_report import read_evaluation_report
 from dreamfleet.common.cli.global_config import TABLES
 from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.common.runs.seeds import TEST
 from dreamfleet.coordinator.addons.metrics.prometheus import collect_metrics
 from dreamfleet.experiments.local.run_arguments import RunArguments
-from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
 from tests.support.processes import ROOT
 from tests.support.samples import STATUS
 

@@ -15,11 +15,11 @@ import numpy as np
 import pygame
 import pytest
 
+from dreamfleet.common.addons.evaluation_report import EvaluationReport
 from dreamfleet.common.artifacts.bundle import Bundle, write_bundle
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.runs.episode_results import EpisodeResult
-from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
 from dreamfleet.worker.worldmodel.onnx_graph import GraphBuilder
 from dreamfleet.worker.worlds.trained_agent import AgentManifest, TrainedAgent
 from tests.support.journals import change_journal

@@ -6,19 +6,22 @@ Pages: quality-diversity.md, own-objective.md, trust.md.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.addons.analysis.run_archive import RunArchive
 from dreamfleet.common.addons.analysis.scored_history import scored_history
+from dreamfleet.common.addons.evaluation_report import REPORT, EvaluationReport, read_evaluation_report
 from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.client.equal_fitness import EqualFitness
 from dreamfleet.common.client.run_view import RunView
-from dreamfleet.common.errors import JournalError
+from dreamfleet.common.errors import DreamfleetError, JournalError
 from dreamfleet.common.printable import format_duration, format_number, format_setting
 from dreamfleet.common.protocol.function_values import value_of
 from dreamfleet.common.protocol.tasks import DREAM, is_function_task
+from dreamfleet.common.runs.lookup import load_controller_of
 from dreamfleet.common.runs.records import (
     RunSettings,
     StoredGeneration,
@@ -78,7 +81,7 @@ def run_row(path: Path, *, as_values: bool) -> dict[str, Any]:
 def run_document(run: RunFolder) -> dict[str, Any]:
     """All of a run for programs: facts, settings, generations and evaluations."""
     settings, history, confirmed = run.settings, run.history(), run.confirmation()
-    checks, archive = run.checks, RunArchive.of(run)
+    checks, archive, evaluated = run.checks, RunArchive.of(run), find_evaluation(run)
     begun = begun_stages(settings, history, run.evaluations()) if settings.stages else ()
     return {
         **_identity(run),
@@ -92,9 +95,18 @@ def run_document(run: RunFolder) -> dict[str, Any]:
         "evaluations": rows_of(run, "evaluations"),
         "stages": [{"number": each.stage.number, "since": each.since, "after": each.why} for each in begun],
         "classes": asdict(run.classes),
+        **({} if evaluated is None else {"evaluated": evaluated.figures}),
         **({} if checks is None else {"checks": asdict(checks)}),
         **({} if archive is None else {"archive": archive.facts}),
     }
+
+
+def find_evaluation(run: RunFolder) -> EvaluationReport | None:
+    """What `evaluate --out` wrote into the run's folder of the controller that the run reports now."""
+    with suppress(DreamfleetError):
+        found = read_evaluation_report(run.path / REPORT)
+        return found if found.controller == load_controller_of(run).sha256 else None
+    return None
 
 
 def run_facts(run: RunFolder) -> dict[str, Any]:
@@ -110,6 +122,8 @@ def run_facts(run: RunFolder) -> dict[str, Any]:
     if run.checks is not None:
         facts["checks"] = run.checks.description
     facts["reported"] = view_of(run).score
+    if (evaluated := find_evaluation(run)) is not None:
+        facts["evaluated"] = "; ".join(evaluated.describe_scores(score_word_of_run(run.spec, run.bundle_path)))
     if (network := run.fact("network")) not in (None, "{}"):  # a resumed run listens where a stranger's journal says
         facts["network"] = network
     if is_function_task(settings.task.task):

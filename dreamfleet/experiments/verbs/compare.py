@@ -21,6 +21,7 @@ from dreamfleet.common.addons.analysis.comparison import (
     differing_values,
     paired_scores,
 )
+from dreamfleet.common.addons.evaluation_report import EvaluationReport, read_evaluation_report
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import UsageError
@@ -36,7 +37,6 @@ from dreamfleet.common.worlds.score_words import score_word
 from dreamfleet.experiments.sweep import summary
 from dreamfleet.experiments.sweep.folder import find_sweep
 from dreamfleet.experiments.verbs.sweep import print_settings
-from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport, read_evaluation_report
 
 SUMMARY = (
     "compare runs (settings that differ, scores at equal steps and core-hours, confirmed scores), reports of "

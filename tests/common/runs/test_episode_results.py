@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dreamfleet.common.addons.evaluation_report import EvaluationReport, read_evaluation_report
 from dreamfleet.common.artifacts.bundle_store import find_bundle, pretrained_folder
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.subspace import Subspace
@@ -32,7 +33,6 @@ from dreamfleet.coordinator.addons.runs.stored_run import open_run
 from dreamfleet.coordinator.settings.config import RunConfig
 from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.storage.journal import Journal
-from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport, read_evaluation_report
 from dreamfleet.worker.addons.verification.reproduction import Reproduction
 from tests.support.journals import confirm
 from tests.support.processes import call_here, printed

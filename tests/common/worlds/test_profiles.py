@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from dreamfleet import find_controller
+from dreamfleet.common.addons.evaluation_report import read_evaluation_report
 from dreamfleet.common.artifacts.bundle_store import pretrained_folder
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.cli.presets import default_run_preset, default_training_preset
@@ -21,7 +22,6 @@ from dreamfleet.common.runs.seeds import TEST
 from dreamfleet.common.worlds.score_words import profile_of, score_word_of_run
 from dreamfleet.common.worlds.shipped import WORLDS
 from dreamfleet.coordinator.settings.config import RunConfig
-from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
 from dreamfleet.worker.addons.evaluation.known_score import KnownScore, find_known_score, first_seed, median_drive
 from dreamfleet.worker.tasks.registry import find_world
 from dreamfleet.worker.training.presets import PRESETS

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from dreamfleet.common.addons.evaluation_report import REPORT, EvaluationReport, differing_facts
 from dreamfleet.common.artifacts.bundle import MAX_BUNDLE
 from dreamfleet.common.errors import DreamfleetError, StoppedError, UsageError
 from dreamfleet.common.files.atomic_write import reporting_unwritable_folder
@@ -15,7 +16,6 @@ from dreamfleet.common.runs.episode_results import EpisodeResult
 from dreamfleet.worker.addons.card import card_page
 from dreamfleet.worker.addons.evaluation.agents import make_agent, make_evaluation_spec
 from dreamfleet.worker.addons.evaluation.evaluation import facts_of
-from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport, differing_facts
 from dreamfleet.worker.addons.evaluation.known_score import KnownScore, first_seed, median_drive
 from dreamfleet.worker.addons.recording.verb import is_cut
 from dreamfleet.worker.tasks.api import Assignment
@@ -46,7 +46,7 @@ def write_card(
         if report is not None:
             from dreamfleet.worker.addons.card.score_chart import draw_scores  # matplotlib
 
-            (folder / card_page.REPORT).write_text(report.to_json() + "\n")
+            (folder / REPORT).write_text(report.to_json() + "\n")
             (folder / card_page.SCORES).write_bytes(draw_scores(report, contents.name))
         if steps:
             _try(contents, card_page.VIDEO, lambda: _film(contents, folder / card_page.VIDEO, steps, on_step, stop))

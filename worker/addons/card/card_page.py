@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from dreamfleet.common.addons.evaluation_report import REPORT, EvaluationReport
 from dreamfleet.common.addons.markdown import as_code, as_text
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import IMPORTED, Controller
@@ -16,10 +17,9 @@ from dreamfleet.common.runs.episode_results import EpisodeResult
 from dreamfleet.common.runs.seeds import TEST
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.score_words import profile_of, score_word
-from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
 from dreamfleet.worker.addons.evaluation.known_score import find_known_score
 
-PAGE, CONTROLLER, BUNDLE, REPORT = "README.md", "controller.npz", "bundle.zip", "evaluation.json"
+PAGE, CONTROLLER, BUNDLE = "README.md", "controller.npz", "bundle.zip"
 DRIVER, SCRIPT, SCORES = "controller.onnx", "drive.py", "scores.png"
 VIDEO = "replay.mp4"  # the name under which model hubs look for it
 WHAT = {

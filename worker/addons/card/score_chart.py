@@ -5,10 +5,10 @@ import io
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from dreamfleet.common.addons.evaluation_report import EvaluationReport
 from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.worlds.score_words import score_word
-from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
 
 COLOUR, MEAN = "#3b6ea5", "#c0392b"
 

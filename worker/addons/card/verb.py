@@ -4,6 +4,7 @@ import argparse
 from contextlib import ExitStack
 from pathlib import Path
 
+from dreamfleet.common.addons.evaluation_report import read_evaluation_report
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.cli.progress import progress_bar
@@ -14,7 +15,6 @@ from dreamfleet.common.host.stop_signals import stop_on_signals
 from dreamfleet.common.host.unseen_drawing import draw_unseen
 from dreamfleet.common.runs.lookup import find_bundle_of, find_controller
 from dreamfleet.worker.addons.card.card_page import CardContents
-from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
 from dreamfleet.worker.addons.recording.verb import MOST_STEPS
 
 SUMMARY = "write a controller as a folder to publish: a model card, scores, a video, ONNX, a script without dreamfleet"

@@ -9,6 +9,7 @@ from statistics import fmean
 from time import perf_counter
 from typing import Any
 
+from dreamfleet.common.addons.evaluation_report import EvaluationReport
 from dreamfleet.common.cli.progress import progress_bar
 from dreamfleet.common.errors import DreamfleetError, StoppedError
 from dreamfleet.common.host.fingerprint import fingerprint
@@ -23,7 +24,6 @@ from dreamfleet.common.protocol.result_bounds import rejection_reason
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
 from dreamfleet.worker.addons.evaluation.agents import Agent, masked
-from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
 from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition, score
 from dreamfleet.worker.scoring.failure_cause import crash, failure_of
 from dreamfleet.worker.tasks.api import Score, World

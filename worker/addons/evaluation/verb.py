@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dreamfleet.common.addons.analysis.run_archive import find_elite
+from dreamfleet.common.addons.evaluation_report import check_seed_range
 from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
 from dreamfleet.common.cli.key_values import ENVIRONMENT_EXAMPLE, parse_arguments
@@ -19,7 +20,6 @@ from dreamfleet.common.files.atomic_write import check_output_path, open_output
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.runs.lookup import find_bundle_of
 from dreamfleet.common.runs.seeds import TEST
-from dreamfleet.worker.addons.evaluation.evaluation_report import check_seed_range
 from dreamfleet.worker.addons.evaluation.named_agents import find_driver, is_random
 from dreamfleet.worker.service.bundle_fetch import fetch_bundle_of
 
@@ -61,7 +61,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add_global_flags(parser, "runs_dir")
     parser.add_argument("--json", action="store_true", help="print every figure and drive as JSON")
-    parser.add_argument("--out", type=Path, help="also write that JSON to this file, for `compare` and `verify report`")
+    parser.add_argument(
+        "--out", type=Path, help="also write that JSON to this file, for `compare`, `verify report` and `card`; "
+        "`runs show` reads evaluation.json in the run's folder",
+    )  # fmt: skip
 
 
 def add_random_flags(parser: argparse.ArgumentParser) -> None:

@@ -10,13 +10,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dreamfleet.common.addons.evaluation_report import EvaluationReport, read_evaluation_report
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer
 from dreamfleet.common.errors import BundleError, ControllerError, UsageError
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.runs.lookup import find_bundle_of
-from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport, read_evaluation_report
 from dreamfleet.worker.addons.evaluation.named_agents import find_agent, is_random, make_random_agent
 from dreamfleet.worker.addons.verification.reproduction import Reproduction
 

@@ -4,10 +4,10 @@ from dataclasses import astuple, dataclass
 from functools import cached_property
 from itertools import starmap
 
+from dreamfleet.common.addons.evaluation_report import EvaluationReport, contradicts, differing_facts
 from dreamfleet.common.printable import format_number, one_line, plural
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
 from dreamfleet.common.runs.paired_difference import PairedDifference
-from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport, contradicts, differing_facts
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ from dreamfleet.common.addons.analysis.comparison import (
 from dreamfleet.common.addons.analysis.fitness_chart import WINDOW, running_median
 from dreamfleet.common.addons.analysis.learning import LearningCurve, Point
 from dreamfleet.common.addons.analysis.scored_history import effort_axes
+from dreamfleet.common.addons.evaluation_report import EvaluationReport
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.client.equal_fitness import ENOUGH, EqualFitness
@@ -40,6 +41,7 @@ from dreamfleet.common.protocol.function_values import value_of
 from dreamfleet.common.protocol.host_classes import NON_DETERMINISTIC
 from dreamfleet.common.runs.effort import START_EFFORT, Effort
 from dreamfleet.common.runs.episode_results import EpisodeResult
+from dreamfleet.common.runs.lookup import load_controller_of
 from dreamfleet.common.runs.records import (
     StageSettings,
     StoredEvaluation,
@@ -59,7 +61,6 @@ from dreamfleet.coordinator.addons.runs import run_details
 from dreamfleet.coordinator.addons.runs.plot import fitness_figure, learning_figure, save_figure
 from dreamfleet.coordinator.addons.status.status_panel import panel_lines
 from dreamfleet.experiments.minimise import _Searches
-from dreamfleet.worker.addons.evaluation.evaluation_report import EvaluationReport
 from dreamfleet.worker.addons.evaluation.known_score import find_known_score
 from dreamfleet.worker.addons.verification.candidate_verb import _in_values
 from dreamfleet.worker.addons.verification.replay import ReplayedEpisode
@@ -223,6 +224,23 @@ def test_the_commands_of_a_run_in_an_environment_of_a_module_run_as_printed(proc
 
 def shown():
     return dict(row for line in printed("runs", "show", "reality").splitlines() if len(row := cells(line)) == 2)
+
+
+def test_an_evaluation_in_the_folder_of_the_reported_controller_is_shown_with_its_blind_scores(runs):
+    path, drives = runs / "reality" / "evaluation.json", [EpisodeResult(seed, 10.0 * seed, 5) for seed in (1, 2, 3)]
+    with RunFolder(runs / "reality") as run:
+        reported = load_controller_of(run).sha256
+    hidden = tuple(replace(each, score=each.score / 2) for each in drives)
+    own = replace(REPORT, controller=reported, options="", drives=tuple(drives), hidden=hidden, foreign=hidden)
+    path.write_text(own.to_json())
+    found = json.loads(printed("runs", "show", "reality", "--json"))["evaluated"]
+    assert (found["mean"], found["hidden_mean"], found["foreign_loss"]) == (20, 10, 10)
+    assert found["hidden_loss_error"] == pytest.approx(5 / np.sqrt(3))
+    assert {20.0, 10.0, 2.9} <= set(numbers(shown()["evaluated"]))
+    for other in (replace(own, controller="ab" * 32).to_json(), "{"):
+        path.write_text(other)
+        assert "evaluated" not in shown()
+        assert "evaluated" not in json.loads(printed("runs", "show", "reality", "--json"))
 
 
 def test_settings_that_do_not_apply_are_left_out_and_json_has_all(runs):

@@ -9,13 +9,13 @@ import av
 import numpy as np
 import pytest
 
+from dreamfleet.common.addons.evaluation_report import read_evaluation_report
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Continuous, Discrete
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
 from dreamfleet.common.cli import command_line
 from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.addons.baselines.agents import RandomPolicy
 from dreamfleet.worker.addons.evaluation import evaluation
-from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
 from dreamfleet.worker.addons.evaluation.named_agents import DISCRETE, RANDOM, find_driver
 from dreamfleet.worker.scoring.episode import EpisodeConfig
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 
+from dreamfleet.common.addons.evaluation_report import read_evaluation_report
 from dreamfleet.common.artifacts.bundle import DREAM_GRAPH
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import ControllerError, DatasetError, StoppedError, UsageError
@@ -28,7 +29,6 @@ from dreamfleet.worker.addons.baselines.presets import AgentConfig, LearningConf
 from dreamfleet.worker.addons.baselines.train import CHECKPOINT, CURVE, episode_file, train_drqn
 from dreamfleet.worker.addons.evaluation import evaluation
 from dreamfleet.worker.addons.evaluation.agents import make_agent
-from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
 from dreamfleet.worker.addons.evaluation.named_agents import find_agent, find_driver
 from dreamfleet.worker.scoring.episode import EpisodeConfig, run_episode
 from dreamfleet.worker.tasks.model_free_policies import NO_PARAMETERS

@@ -19,6 +19,7 @@ import yaml
 from markdown_it import MarkdownIt
 
 from dreamfleet import UsageError, evaluate, find_controller
+from dreamfleet.common.addons.evaluation_report import read_evaluation_report
 from dreamfleet.common.artifacts.controller import IMPORTED, Controller, ControllerShape
 from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.printable import one_line
@@ -30,7 +31,6 @@ from dreamfleet.worker.addons.card.driver_graph import export_driver, largest_di
 from dreamfleet.worker.addons.card.score_chart import draw_scores
 from dreamfleet.worker.addons.evaluation.agents import make_agent
 from dreamfleet.worker.addons.evaluation.evaluation import judge
-from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
 from dreamfleet.worker.addons.evaluation.known_score import find_known_score
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worldmodel.inference import open_graph
@@ -42,6 +42,7 @@ from tests.support.tasks import TOY
 from tests.support.variants import VARIANTS, controller_of, vectors
 
 REPORT = ROOT / "docs" / "lab" / "results" / "real.json"
+SCORES = {"hidden": 123.4, "foreign": 56.7}  # of blind drives
 WITHOUT_DREAMFLEET = (
     "import runpy, sys; sys.modules['dreamfleet'] = None; runpy.run_path('drive.py', run_name='__main__')"
 )
@@ -192,6 +193,19 @@ def test_a_card_shows_each_name_as_it_is(name):
     assert f"{shown} judge" in scores
     assert f"{shown} version" in scores
     assert draw_scores(report, name)
+
+
+def test_a_card_has_the_blind_scores_beside_the_plain_one():
+    controller, plain = (
+        Controller(ControllerShape(1, 1), np.zeros(2, np.float32), TOY, ""),
+        read_evaluation_report(REPORT),
+    )
+    blind = {sight: tuple(replace(each, score=score) for each in plain.drives) for sight, score in SCORES.items()}
+    report = replace(plain, **blind)
+    text = "\n".join(describe_card(CardContents(controller, None, report, "toy"), []))
+    loss = format_with_error(report.figures["hidden_loss"], report.figures["hidden_loss_error"])
+    assert all(f"{score:.1f}" in text for score in (plain.results.mean, *SCORES.values()))
+    assert loss in text
 
 
 def test_what_draws_no_pictures_has_a_card_without_a_video_that_says_why(tmp_path, capsys):

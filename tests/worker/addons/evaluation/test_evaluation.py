@@ -16,6 +16,7 @@ import pytest
 
 import dreamfleet
 from dreamfleet import make_environment, make_policy
+from dreamfleet.common.addons.evaluation_report import read_evaluation_report
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
@@ -32,7 +33,6 @@ from dreamfleet.worker.addons.evaluation.evaluation import (
     evaluate,
     evaluate_in_processes,
 )
-from dreamfleet.worker.addons.evaluation.evaluation_report import read_evaluation_report
 from dreamfleet.worker.scoring import episode
 from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition
 from dreamfleet.worker.tasks.api import Score, World

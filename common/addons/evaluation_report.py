@@ -24,6 +24,7 @@ from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults
 from dreamfleet.common.runs.standard_error import format_with_error, score_digits, standard_error
 from dreamfleet.common.schema.validation import OPTIONAL, MalformedError, Seconds, from_plain_lenient
 
+REPORT = "evaluation.json"  # its name in a run's folder and in a card's
 GYMNASIUM = "gymnasium"  # the judge of worlds that gymnasium itself has
 FACTS = "controller", "task", "options", "world", "judge", "bundle", "threshold", "marks"  # what was driven
 MAX_MARKS = 8
@@ -100,8 +101,9 @@ class EvaluationReport:
             "loss": fmean(less), "loss_error": standard_error(less),
         }  # fmt: skip
 
-    def _describe_blind(self, word: str) -> list[str]:
-        lines = []
+    def describe_scores(self, word: str = "seed") -> list[str]:
+        """The score in words, then the blind ones if they were driven."""
+        lines = [self._describe_score(word)]
         for sight, text in SIGHTS.items():
             if found := self._blind_figures(sight):
                 score, loss = (format_with_error(found[key] or 0.0, found[f"{key}_error"]) for key in ("mean", "loss"))
@@ -112,11 +114,12 @@ class EvaluationReport:
         """A text for display: the score, figures on driving, the threshold and the controller; `word`: one seed."""
         failures = self.results.failure_text
         above = [f"above {mark:g}: {self.results.above(mark):.0%}" for mark in self.marks]
+        score, *blind = self.describe_scores(word)
         lines = (
             failures and f"{failures}; all figures are over the episodes with a score",
-            self._describe_score(word),
+            score,
             ", ".join([*above, *_describe_driving(self.results)]),
-            *self._describe_blind(word),
+            *blind,
             self._describe_threshold(word),
             self._describe_origin(),
         )
