@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from statistics import fmean, median
 
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.printable import join_some, plural
 from dreamfleet.common.runs.standard_error import format_with_error, sample_std, standard_error
 from dreamfleet.common.schema.display import Displayed
-from dreamfleet.common.schema.validation import Count
+from dreamfleet.common.schema.validation import OPTIONAL, Count
 
 MAX_NAMED = 3  # failed episodes in a text
 
@@ -25,6 +25,7 @@ class EpisodeResult:
     finished: bool | None = None  # whether it completed the course, such as a whole lap
     speed: float | None = None  # mean over its steps, in the environment's unit
     braking: float | None = None  # share of its steps with the brake on
+    figures: dict[str, float] | None = field(default=None, metadata=OPTIONAL)  # of its world, by name
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,7 @@ class World(DisplayedFields):
     finish: str = ""  # key of the environment's `info`: whether the course was driven to its end; empty: there is none
     judge: str = ""  # "gymnasium" where reported scores are of its own environment
     score_word: str = "seed"  # what a scored seed is called: "track", "game"
+    figures: tuple[str, ...] = ()  # numbers in an episode's last `info` of which reports say the mean
     marks: tuple[float, ...] = ()  # scores to compare with: reports say what share of the episodes exceeds each
     # Of worlds in which world models are trained (docs/reference/worlds.md):
     mirror: Mirror | None = None  # the action in a left-right mirrored picture; `None`: such pictures show no drive

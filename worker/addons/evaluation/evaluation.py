@@ -173,16 +173,16 @@ class DriveStatistics:
     """Collects statistics of one episode, as far as its world reports them."""
 
     def __init__(self, world: World, truth: Callable[[], dict[str, float]] | None) -> None:
-        self._truth, self._finish = truth, world.finish
+        self._truth, self._finish, self._named = truth, world.finish, world.figures
         named = truth is not None and BRAKE in world.action_names
         self._brake = world.action_names.index(BRAKE) if named else None
         self._speeds: list[float] = []
         self._braked: list[bool] = []
-        self._finished = False
+        self._info: dict[str, Any] = {}
 
     def on_transition(self, moment: Transition) -> None:
         """Add a step."""
-        self._finished = bool(moment.info.get(self._finish, False))
+        self._info = moment.info
         true_state = self._truth() if self._truth is not None else {}
         if SPEED in true_state:
             self._speeds.append(true_state[SPEED])
@@ -191,8 +191,11 @@ class DriveStatistics:
 
     def drive(self, seed: int, score: Score) -> EpisodeResult:
         """The result of the whole episode."""
-        finished = self._finished if self._finish else None
-        return EpisodeResult(seed, score.fitness, score.steps, finished, _mean(self._speeds), _mean(self._braked))
+        finished = bool(self._info.get(self._finish, False)) if self._finish else None
+        figures = {name: float(self._info[name]) for name in self._named if name in self._info} or None
+        return EpisodeResult(
+            seed, score.fitness, score.steps, finished, _mean(self._speeds), _mean(self._braked), figures
+        )
 
 
 def _mean(values: Sequence[float]) -> float | None:

@@ -18,6 +18,8 @@ from dreamfleet.worker.worlds.takecover.process import start_game
 HEIGHT, WIDTH = 120, 160  # of the game's picture
 SCREEN = 480, 640  # height and width of what a person sees
 TICS_PER_SECOND = 35
+WALLS, FAR = (16.0, 752.0), 120.0  # where the player's side ends, and how far from there a turn shows that it sees
+FAR_TURNS = "share_of_turns_far_from_walls"  # in `info`, once it has turned
 LIMIT = 2100  # tics of an episode at most: a minute
 SKILL = 4  # the one to which published scores fit
 STAY, LEFT, RIGHT = range(3)
@@ -56,7 +58,8 @@ class TakeCover(gymnasium.Env[Pixels, int]):
         self._vizdoom: Any = vizdoom
         self._tics, self._screen = tics, screen
         self._game: Any = None
-        self._lived = 0
+        self._lived = self._turns = self._far_turns = 0
+        self._direction = STAY
         self._picture: Pixels = np.zeros((*(SCREEN if screen else (HEIGHT, WIDTH)), 3), np.uint8)
         if screen:
             self.observation_space = spaces.Box(0, 255, self._picture.shape, np.uint8)
@@ -71,16 +74,19 @@ class TakeCover(gymnasium.Env[Pixels, int]):
             self._game = self._start()
         self._game.set_seed(int(self.np_random.integers(2**31)) if seed is None else fold_seed(seed))
         self._game.new_episode()
-        self._lived = 0
+        self._lived = self._turns = self._far_turns = 0
+        self._direction = STAY
         return self._observe(), {}
 
     def step(self, action: int) -> tuple[Pixels, float, bool, bool, dict[str, Any]]:
         """Hold the action for `tics` tics, fewer at the end of the episode."""
+        self._count_turn(action)
         held = min(self._tics, LIMIT - self._lived)
         reward = float(self._game.make_action(BUTTONS[action], held))
         self._lived += held
         died = bool(self._game.is_episode_finished())
-        return self._observe(), reward, died, not died and self._lived >= LIMIT, {}
+        info = {FAR_TURNS: self._far_turns / self._turns} if self._turns else {}
+        return self._observe(), reward, died, not died and self._lived >= LIMIT, info
 
     def render(self) -> Any:
         """The last picture."""
@@ -91,6 +97,16 @@ class TakeCover(gymnasium.Env[Pixels, int]):
         if self._game is not None:
             self._game.close()
             self._game = None
+
+    def _count_turn(self, action: int) -> None:
+        """Count a turn where the player goes the other way than last."""
+        if action == STAY:
+            return
+        if self._direction not in (STAY, action):
+            side = self._game.get_game_variable(self._vizdoom.GameVariable.POSITION_Y)
+            self._turns += 1
+            self._far_turns += min(abs(side - wall) for wall in WALLS) > FAR
+        self._direction = action
 
     def _observe(self) -> Pixels:
         if (state := self._game.get_state()) is not None:

@@ -21,7 +21,7 @@ from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.tasks.registry import preprocessing_for
 from dreamfleet.worker.worldmodel.policy import ModelPolicy
 from dreamfleet.worker.worlds.bilinear import shrink
-from dreamfleet.worker.worlds.takecover.game import BAND, LEFT, RIGHT, STAY, TakeCover, observe_band
+from dreamfleet.worker.worlds.takecover.game import BAND, FAR_TURNS, LEFT, RIGHT, STAY, TakeCover, observe_band
 from dreamfleet.worker.worlds.takecover.masking import MaskedTakeCover
 from dreamfleet.worker.worlds.takecover.options import TakeCoverOptions
 
@@ -68,6 +68,7 @@ def make_world(options: TakeCoverOptions) -> World:
         threshold=SOLVED,
         score_word="game",
         marks=(SOLVED,),
+        figures=(FAR_TURNS,),
         mirror=Mirror((0, 2, 1), (1, 1, 1)) if actions.choices else Mirror((0,), (-1,)),
         preset="takecover",
     )

@@ -14,6 +14,7 @@ import numpy as np
 SHARED = tuple(Path("/dev/shm", name) for name in ("ViZDoomSM", "ViZDoomMQCtr", "ViZDoomMQDoom"))
 scenarios_path = str(Path(__file__).parent)
 ScreenResolution = SimpleNamespace(RES_160X120=(120, 160), RES_640X480=(480, 640))
+GameVariable = SimpleNamespace(POSITION_Y="POSITION_Y")
 ScreenFormat = SimpleNamespace(RGB24="RGB24")
 SET = {
     "set_doom_skill": [4], "set_living_reward": [1], "set_window_visible": [False], "set_render_hud": [False, True],
@@ -68,7 +69,7 @@ class DoomGame:
         self._seed = seed
 
     def new_episode(self):
-        self._tic, self._moves = 0, 0
+        self._tic, self._moves, self._side = 0, 0, 384.0
         self._last = 40 + self._seed % 50
 
     def get_state(self):
@@ -86,7 +87,12 @@ class DoomGame:
             self._tic += 1
             self._moves = self._moves * 3 % 2**31 + buttons[0] + 2 * buttons[1]
             self._last += buttons[1]
+            self._side = min(max(self._side + 8 * (buttons[0] - buttons[1]), 16.0), 752.0)
         return float(lived)
+
+    def get_game_variable(self, name):
+        assert name == GameVariable.POSITION_Y
+        return self._side
 
     def is_episode_finished(self):
         return self._tic >= self._last

@@ -1,4 +1,4 @@
-"""Tests evaluation.py, evaluation_report.py, agents.py, predictor.py, verb.py,
+"""Tests evaluation.py, common/addons/evaluation_report.py, agents.py, predictor.py, verb.py,
 worker/addons/verification/report_verb.py, dreamfleet/experiments/controllers.py and common/host/process_pool.py."""
 
 import json
@@ -16,7 +16,7 @@ import pytest
 
 import dreamfleet
 from dreamfleet import make_environment, make_policy
-from dreamfleet.common.addons.evaluation_report import read_evaluation_report
+from dreamfleet.common.addons.evaluation_report import EvaluationReport, read_evaluation_report
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
@@ -250,6 +250,19 @@ def test_a_world_without_a_true_state_has_no_statistics():
     watch = DriveStatistics(World(STEERING_GAS_BRAKE, action_names=("steer", "gas", "brake")), None)
     watch.on_transition(moment({"lap_finished": True}))
     assert watch.drive(3, Score(5.0, 1)) == EpisodeResult(3, 5.0, 1)
+
+
+def test_what_a_world_says_of_an_episode_at_its_end_is_reported_as_a_mean():
+    drives = []
+    for seed, infos in ((1, ({"turns": 9}, {"turns": 2, "other": 1})), (2, ({},)), (3, ({"turns": 3},))):
+        watch = DriveStatistics(replace(find_task("car-racing").world, figures=("turns",)), None)
+        for info in infos:
+            watch.on_transition(moment(info))
+        drives.append(watch.drive(seed, Score(5.0, 1)))
+    assert [each.figures for each in drives] == [{"turns": 2.0}, None, {"turns": 3.0}]
+    report = EvaluationReport("a", "ab", "a", "a", "", "", "", 1.0, tuple(drives))
+    assert report.figures["turns"] == 2.5
+    assert "2.5" in report.describe()
 
 
 @pytest.mark.parametrize(

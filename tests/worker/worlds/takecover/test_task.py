@@ -27,7 +27,7 @@ from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.recordable import RecordableTask, TaskWithOptions, TaskWithPolicies
 from dreamfleet.worker.tasks.registry import find_task, find_world
 from dreamfleet.worker.worlds.takecover import process
-from dreamfleet.worker.worlds.takecover.game import LEFT, LIMIT, RIGHT, STAY, TakeCover
+from dreamfleet.worker.worlds.takecover.game import FAR_TURNS, LEFT, LIMIT, RIGHT, STAY, TakeCover
 from dreamfleet.worker.worlds.takecover.options import TakeCoverOptions
 from dreamfleet.worker.worlds.takecover.process import ARGUMENTS, FOLDER_PREFIX, GAME_NAME_FLAG, SHARED_FILES
 from dreamfleet.worker.worlds.takecover.task import TakeCoverTask, cut_in_thirds, pick_choice
@@ -66,6 +66,18 @@ def test_the_whole_screen_shows_the_same_game(doom):
         over = any(one[1:])
     small.close()
     large.close()
+
+
+def test_turns_far_from_the_walls_are_a_share_of_all_turns(doom):
+    game, told = TakeCover(2), []
+    for seed in (3, 4):  # the count begins anew
+        game.reset(seed=seed)
+        told.append([game.step(action)[-1].get(FAR_TURNS) for action in [RIGHT] * 2 + [STAY, RIGHT, LEFT, STAY, RIGHT]])
+        assert told[-1] == [None] * 4 + [1.0] * 3
+    for _ in range(60):
+        game.step(RIGHT)
+    assert game.step(LEFT)[-1][FAR_TURNS] == 2 / 3
+    game.close()
 
 
 @pytest.mark.parametrize("options", ["", ALL_CHANGED])
