@@ -43,13 +43,14 @@ def checkpoint_of(source: Path) -> Path | None:
     return source if source.suffix.lower() == ".tar" else None
 
 
-def is_attention_agent(path: Path) -> bool:
-    """Whether a file is of AttentionAgent."""
+def find_attention_agent(source: Path) -> Path | None:
+    """The weights of AttentionAgent that a path names: a file, or `model.npz` in a folder; `None` for other sources."""
+    path = source / "model.npz" if source.is_dir() else source
     try:
         with open_regular(path) as file, open_archive(file, AGENT_LIMITS) as archive:
-            return archive.names == {f"{AGENT_ARRAY}.npy"}
+            return path if archive.names == {f"{AGENT_ARRAY}.npy"} else None
     except (OSError, DamagedArchiveError):
-        return False
+        return None
 
 
 def drive_paths(source: Path) -> list[Path]:

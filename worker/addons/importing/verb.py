@@ -69,8 +69,8 @@ def run(args: argparse.Namespace) -> int:
     sources.refuse_unreadable(source)
     if source.is_dir() and sources.holds_json_model(source):
         return _import_world_model(args)
-    if source.suffix == ".npz" and sources.is_attention_agent(source):
-        return _import_agent(args)
+    if agent := sources.find_attention_agent(source):
+        return _import_agent(args, agent)
     if source.suffix == ".npz" or (source.is_dir() and sources.drive_paths(source)):
         return _import_drives(args)
     return _import_controller(args)
@@ -92,11 +92,11 @@ def _import_world_model(args: argparse.Namespace) -> int:
     return 0
 
 
-def _import_agent(args: argparse.Namespace) -> int:
+def _import_agent(args: argparse.Namespace, path: Path) -> int:
     from dreamfleet.worker.addons.importing.attention_agent import import_attention_agent
 
     check_output_path(args.out)
-    agent = import_attention_agent(args.source)
+    agent = import_attention_agent(path)
     with reporting_write_errors(args.out):
         agent.save(args.out)
     text = f"{args.out}: {agent}; `{shell_command('evaluate', '--controller', args.out)}` scores it"

@@ -89,6 +89,11 @@ def test_a_network_that_wants_to_move_does(file, tmp_path):
         assert policy.act(np.zeros((96, 96, 3), np.uint8)).tolist() == wanted
 
 
+def test_its_folder_is_the_same_agent(file, agent, tmp_path):
+    assert main(["import", str(file.parent), "--out", str(tmp_path / "other.zip")]) == 0
+    assert (tmp_path / "other.zip").read_bytes() == agent.read_bytes()
+
+
 def test_evaluate_plays_it_and_equal_games_have_equal_scores(agent, tmp_path, monkeypatch, capsys):
     use_fake(monkeypatch)
     reports = []
