@@ -93,9 +93,9 @@ class EvaluationReport:
     @property
     def world_figures(self) -> dict[str, float]:
         """The means of what the world says of its episodes, over those of which it says it."""
-        told = [each.figures or {} for each in self.drives]
-        names = sorted({name for each in told for name in each})
-        return {name: fmean(each[name] for each in told if name in each) for name in names}
+        found = [each.figures or {} for each in self.drives]
+        names = sorted({name for each in found for name in each})
+        return {name: fmean(each[name] for each in found if name in each) for name in names}
 
     def _blind_figures(self, sight: str) -> dict[str, float | None]:
         """The mean of what was driven blind, and how much less it is than with sight, seed by seed."""
@@ -122,12 +122,12 @@ class EvaluationReport:
         """A text for display: the score, figures on driving, the threshold and the controller; `word`: one seed."""
         failures = self.results.failure_text
         above = [f"above {mark:g}: {self.results.above(mark):.0%}" for mark in self.marks]
-        told = [f"{one_line(name).replace('_', ' ')}: {mean:.3g}" for name, mean in self.world_figures.items()]
+        of_world = [f"{one_line(name).replace('_', ' ')}: {mean:.3g}" for name, mean in self.world_figures.items()]
         score, *blind = self.describe_scores(word)
         lines = (
             failures and f"{failures}; all figures are over the episodes with a score",
             score,
-            ", ".join([*above, *_describe_driving(self.results), *told]),
+            ", ".join([*above, *_describe_driving(self.results), *of_world]),
             *blind,
             self._describe_threshold(word),
             self._describe_origin(),

@@ -69,11 +69,11 @@ def test_the_whole_screen_shows_the_same_game(doom):
 
 
 def test_turns_far_from_the_walls_are_a_share_of_all_turns(doom):
-    game, told = TakeCover(2), []
+    game, seen = TakeCover(2), []
     for seed in (3, 4):  # the count begins anew
         game.reset(seed=seed)
-        told.append([game.step(action)[-1].get(FAR_TURNS) for action in [RIGHT] * 2 + [STAY, RIGHT, LEFT, STAY, RIGHT]])
-        assert told[-1] == [None] * 4 + [1.0] * 3
+        seen.append([game.step(action)[-1].get(FAR_TURNS) for action in [RIGHT] * 2 + [STAY, RIGHT, LEFT, STAY, RIGHT]])
+        assert seen[-1] == [None] * 4 + [1.0] * 3
     for _ in range(60):
         game.step(RIGHT)
     assert game.step(LEFT)[-1][FAR_TURNS] == 2 / 3
