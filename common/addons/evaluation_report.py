@@ -5,19 +5,19 @@ Pages: own-environment.md, own-world-model.md.
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from math import isclose
 from pathlib import Path
 from statistics import fmean
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.regular_files import read_text
 from dreamfleet.common.host.processes import shell_command
-from dreamfleet.common.printable import format_number, one_line, truncate
+from dreamfleet.common.printable import format_number, one_line, plural, truncate
 from dreamfleet.common.protocol.function_values import minimises
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
@@ -30,9 +30,14 @@ FACTS = "controller", "task", "options", "world", "judge", "bundle", "threshold"
 MAX_MARKS = 8
 MIN_EPISODES_TO_SOLVE = 100  # customary number of episodes for gymnasium's threshold of solving an environment
 MAX_BYTES, MAX_EPISODES, MAX_SEED = 64 << 20, 10**5, 2**63
-SIGHTS = {"hidden": "blind", "foreign": "with another's sight"}  # fields of what was driven so, and how it is called
+Sight = Literal["hidden", "foreign"]
+SIGHTS: dict[Sight, str] = {"hidden": "blind", "foreign": "with another's sight"}  # fields, and what they are called
+FAILED = "_failed"  # after such a name: the field of its episodes without a score
+BLIND_FIGURES = "n", "mean", "mean_error", "loss", "loss_error"
 ABOVE = "above_"  # and a mark: the share of scores above it
 Drives = Annotated[tuple[EpisodeResult, ...], Meta(min_length=1, max_length=MAX_EPISODES)]
+BlindDrives = Annotated[tuple[EpisodeResult, ...], Meta(max_length=MAX_EPISODES)]
+Failures = Annotated[tuple[FailedEpisode, ...], Meta(max_length=MAX_EPISODES)]
 
 
 @dataclass(frozen=True)
@@ -52,20 +57,33 @@ class EvaluationReport:
     #: mean score from which the environment counts as solved; `None` if none is named
     threshold: float | None = field(default=None, metadata=OPTIONAL)
     #: episodes without a score; every statistic leaves them out
-    failed: Annotated[tuple[FailedEpisode, ...], Meta(max_length=MAX_EPISODES)] = field(default=(), metadata=OPTIONAL)
+    failed: Failures = field(default=(), metadata=OPTIONAL)
     #: scores of which the share of episodes above them is reported
     marks: Annotated[tuple[float, ...], Meta(max_length=MAX_MARKS)] = field(default=(), metadata=OPTIONAL)
     #: of `task`, as a run freezes them
     options: str = field(default="", metadata=OPTIONAL)
     #: the same seeds, with what decides painted out of its pictures; empty: not driven
-    hidden: Annotated[tuple[EpisodeResult, ...], Meta(max_length=MAX_EPISODES)] = field(default=(), metadata=OPTIONAL)
+    hidden: BlindDrives = field(default=(), metadata=OPTIONAL)
+    hidden_failed: Failures = field(default=(), metadata=OPTIONAL)
     #: the same, with what decides another episode in its place
-    foreign: Annotated[tuple[EpisodeResult, ...], Meta(max_length=MAX_EPISODES)] = field(default=(), metadata=OPTIONAL)
+    foreign: BlindDrives = field(default=(), metadata=OPTIONAL)
+    foreign_failed: Failures = field(default=(), metadata=OPTIONAL)
 
     @cached_property
     def results(self) -> EpisodeResults:
         """The episodes with their statistics."""
         return EpisodeResults(self.drives, self.failed, minimises(self.task, self.options))
+
+    @property
+    def blind_passes(self) -> "dict[Sight, EvaluationReport]":
+        """What was driven blind, by the name of its field, each as a report of its own; perhaps without any score."""
+        driven = {sight: (getattr(self, sight), getattr(self, sight + FAILED)) for sight in SIGHTS}
+        no_sight: dict[str, Any] = {name: () for sight in SIGHTS for name in (sight, sight + FAILED)}
+        return {
+            sight: replace(self, name=f"{self.name}, {SIGHTS[sight]}", drives=drives, failed=failed, **no_sight)
+            for sight, (drives, failed) in driven.items()
+            if drives or failed
+        }
 
     def to_json(self) -> str:
         """One line of JSON: the statistics, then all fields; a statistic that is unknown is null."""
@@ -81,12 +99,11 @@ class EvaluationReport:
         """The statistics by their names in JSON."""
         results = self.results
         return {
-            **self.world_figures,
             "n": len(results.drives), "mean": results.mean, "std": results.std, "error": results.error,
             "median": results.median, "least": results.worst, "most": results.best, "steps": results.steps,
             "finished": results.finished, "speed": results.speed, "braking": results.braking,
             **{f"{ABOVE}{mark:g}": results.above(mark) for mark in self.marks},
-            "scores": results.scores, "seeds": results.seeds,
+            "scores": results.scores, "seeds": results.seeds, "figures": self.world_figures,
             **{f"{sight}_{key}": value for sight in SIGHTS for key, value in self._blind_figures(sight).items()},
         }  # fmt: skip
 
@@ -97,25 +114,29 @@ class EvaluationReport:
         names = sorted({name for each in found for name in each})
         return {name: fmean(each[name] for each in found if name in each) for name in names}
 
-    def _blind_figures(self, sight: str) -> dict[str, float | None]:
-        """The mean of what was driven blind, and how much less it is than with sight, seed by seed."""
+    def _blind_figures(self, sight: Sight) -> dict[str, float | None]:
+        """The mean of what was driven blind, and how much less it is than with sight, seed by seed.
+
+        They are over the `n` seeds with a score in each pass that has any, so that all passes have the same episodes.
+        """
+        passes = [{each.seed for each in found.drives} for found in self.blind_passes.values() if found.drives]
         plain = {each.seed: each.score for each in self.drives}
-        scores = [(each.seed, each.score) for each in getattr(self, sight)]
-        if not (less := [plain[seed] - score for seed, score in scores if seed in plain]):
-            return {}
-        means = [score for _, score in scores]
-        return {
-            "mean": fmean(means), "mean_error": standard_error(means),
-            "loss": fmean(less), "loss_error": standard_error(less),
-        }  # fmt: skip
+        scores = {each.seed: each.score for each in getattr(self, sight)}
+        if not (seeds := [seed for seed in plain if scores and all(seed in each for each in passes)]):
+            return dict.fromkeys(BLIND_FIGURES)
+        means, less = [scores[seed] for seed in seeds], [plain[seed] - scores[seed] for seed in seeds]
+        values = len(seeds), fmean(means), standard_error(means), fmean(less), standard_error(less)
+        return dict(zip(BLIND_FIGURES, values, strict=True))
 
     def describe_scores(self, word: str = "seed") -> list[str]:
         """The score in words, then the blind ones if they were driven."""
-        lines = [self._describe_score(word)]
-        for sight, text in SIGHTS.items():
-            if found := self._blind_figures(sight):
+        lines, passes = [self._describe_score(word)], self.blind_passes
+        for sight, text in SIGHTS.items() if passes else ():
+            found, parts = self._blind_figures(sight), [passes[sight].results.failure_text] if sight in passes else []
+            if found["n"]:
                 score, loss = (format_with_error(found[key] or 0.0, found[f"{key}_error"]) for key in ("mean", "loss"))
-                lines.append(f"{text}: {score}, {loss} less, {word} by {word}")
+                parts.insert(0, f"{score} on {plural(int(found['n']), word)}, {loss} less, {word} by {word}")
+            lines.append(f"{text}: {'; '.join(filter(None, parts)) or 'no score'}")
         return lines
 
     def describe(self, word: str = "seed") -> str:
@@ -184,17 +205,27 @@ def read_evaluation_report(path: Path) -> EvaluationReport:
         found = from_plain_lenient(EvaluationReport, plain)
         if not isinstance(json.loads(found.options or "{}"), dict):
             raise ValueError("its options are not a JSON object")
-        seeds = [*(each.seed for each in found.drives), *(each.seed for each in found.failed)]
-        if len(set(seeds)) < len(seeds):
-            raise ValueError("a seed occurs twice")
-        if not all(abs(each.score) <= LARGEST_FITNESS for each in found.drives):  # false for NaN too
-            raise ValueError(f"a score is beyond ±{LARGEST_FITNESS:g}")
+        own = _check_episodes(found)
+        for name, blind in found.blind_passes.items():
+            if not _check_episodes(blind) <= own:
+                raise ValueError(f"{name} has a seed that was not driven with sight")
         _check_figures(found, plain)
+        found.to_json()  # `ValueError` for a number that is not finite
         return found
     except FileNotFoundError:
         raise UsageError(f"no report at {path}: `{shell_command('evaluate', '--out', path)}` writes one") from None
     except (OSError, ValueError, TypeError, MalformedError, RecursionError, OverflowError) as error:
         raise UsageError(f"{path} is not a report of `dreamfleet evaluate --out` ({error}): write it again") from error
+
+
+def _check_episodes(report: EvaluationReport) -> set[int]:
+    """The seeds of a report's episodes; `ValueError` for one that occurs twice, or a score out of range."""
+    seeds = [*(each.seed for each in report.drives), *(each.seed for each in report.failed)]
+    if len(set(seeds)) < len(seeds):
+        raise ValueError("a seed occurs twice")
+    if not all(abs(each.score) <= LARGEST_FITNESS for each in report.drives):  # false for NaN too
+        raise ValueError(f"a score is beyond ±{LARGEST_FITNESS:g}")
+    return set(seeds)
 
 
 def _check_figures(report: EvaluationReport, plain: Mapping[str, object]) -> None:
@@ -211,6 +242,10 @@ def _is_equal(stated: object, value: object) -> bool:
     """Whether a figure is that one, up to the last bits of a mean; of scores and seeds, every bit."""
     if isinstance(value, tuple):
         return stated == list(value)
+    if isinstance(value, dict):
+        if not isinstance(stated, dict) or not stated.keys() <= value.keys():
+            return False
+        return all(_is_equal(each, value[name]) for name, each in stated.items())
     return isinstance(stated, int | float) and isinstance(value, int | float) and isclose(stated, value)
 
 

@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from dreamfleet.worker.tasks.api import Score
-from tests.support.tasks import Misbehaving, SideBySide, Toy, ToyEnvironment
+from tests.support.tasks import Masked, Misbehaving, SideBySide, Toy, ToyEnvironment
 
 MODULE = "tests.support.rough_tasks"
 FOLDER = "DREAMFLEET_TEST_LEFT"  # where processes that are left behind write their ids
@@ -49,6 +49,15 @@ class Halting(Toy):
     """The second step of the seeds in `$DREAMFLEET_TEST_HALT` never ends; those in `..._EXIT` end their process."""
 
     probe_steps, environment = 0, HaltingEnvironment
+
+
+class HaltingWithOthersSight(Halting, Masked):
+    """The same where another's sight is driven."""
+
+    environment = ToyEnvironment
+
+    def make_masked_environment(self, assignment, *, foreign):
+        return HaltingEnvironment() if foreign else super().make_masked_environment(assignment, foreign=foreign)
 
 
 def segfault():

@@ -11,14 +11,16 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.tasks.api import Continuous, Score, Task, World
 
 MODULE = "tests.support.tasks"
 NAMES = """Toy SlowToy Raising Crashing Nan Hanging Silent Judged Counted Heavy Chatty Painted Rounded SecondToy Brittle
-Exploding Masked"""
+Exploding Masked Veiled HalfMasked"""
 (
     TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, CHATTY, PAINTED, ROUNDED,
-    SECOND_TOY, BRITTLE, EXPLODING, MASKED,
+    SECOND_TOY, BRITTLE, EXPLODING, MASKED, VEILED,
+    HALF_MASKED,
 ) = (f"{MODULE}:{name}" for name in NAMES.split())  # fmt: skip
 ALL = TOY, SLOW_TOY, RAISING, CRASHING, NAN, HANGING, SILENT, JUDGED, COUNTED, HEAVY, PAINTED
 STEPS_FOLDER = "DREAMFLEET_TEST_STEPS"  # where `Counted` writes
@@ -85,6 +87,34 @@ class Masked(Toy):
     def make_masked_environment(self, assignment, *, foreign):
         cost = 2 if foreign else 1
         return gymnasium.wrappers.TransformReward(self.make_environment(assignment), lambda reward: reward - cost)
+
+
+class FailingOn(gymnasium.Wrapper):
+    def __init__(self, environment, seed):
+        super().__init__(environment)
+        self._seed = seed
+
+    def reset(self, *, seed=None, options=None):
+        if seed == self._seed:
+            raise ArithmeticError("the road is dark")
+        return super().reset(seed=seed, options=options)
+
+
+class Veiled(Masked):
+    """Without sight seed 10001 fails, with another's 10002."""
+
+    def make_masked_environment(self, assignment, *, foreign):
+        masked = super().make_masked_environment(assignment, foreign=foreign)
+        return FailingOn(masked, 10_002 if foreign else 10_001)
+
+
+class HalfMasked(Masked):
+    """It has no other's sight."""
+
+    def make_masked_environment(self, assignment, *, foreign):
+        if foreign:
+            raise UsageError("there is no other episode")
+        return super().make_masked_environment(assignment, foreign=foreign)
 
 
 class SecondToy(Toy):

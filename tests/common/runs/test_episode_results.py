@@ -5,7 +5,7 @@ import json
 import re
 import shlex
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from math import sqrt
 from pathlib import Path
 
@@ -151,6 +151,36 @@ def test_a_report_may_leave_out_its_marks_and_the_last_bits_of_a_mean(tmp_path):
     plain |= {"mean": np.nextafter(plain["mean"], 0.0)}
     (tmp_path / "report.json").write_text(json.dumps(plain))
     assert read_evaluation_report(tmp_path / "report.json") == replace(JUDGEMENT, marks=())
+
+
+BLIND = replace(JUDGEMENT, hidden=DRIVES[:2], hidden_failed=(FailedEpisode(10_002, "E: x"),), foreign=DRIVES[1:])
+
+
+def test_a_blind_pass_is_over_the_seeds_of_all_passes_and_its_failures_stay(tmp_path):
+    (tmp_path / "report.json").write_text(BLIND.to_json())
+    assert read_evaluation_report(tmp_path / "report.json") == BLIND
+    assert [BLIND.figures[f"hidden_{name}"] for name in ("n", "mean", "loss", "loss_error")] == [1, 910.0, 0.0, None]
+    assert "10002, E: x" in BLIND.describe()
+    dark = replace(BLIND, hidden=(), hidden_failed=tuple(FailedEpisode(each.seed, "E: x") for each in DRIVES))
+    assert (dark.figures["hidden_n"], dark.figures["foreign_n"]) == (None, 2), "a pass without any score bars no other"
+    assert "10000, E: x" in dark.describe()
+    without = replace(JUDGEMENT, failed=(BROKEN,), hidden=(replace(DRIVES[0], seed=BROKEN.seed),))
+    (tmp_path / "report.json").write_text(without.to_json())  # only blind it has a score there
+    assert read_evaluation_report(tmp_path / "report.json").figures["hidden_n"] is None
+
+
+@pytest.mark.parametrize("changes", [
+    {"hidden": [replace(DRIVES[0], seed=99)]}, {"foreign": [DRIVES[0]] * 2}, {"hidden_failed": [BROKEN]},
+    {"foreign": DRIVES, "foreign_failed": [FailedEpisode(10_000, "E: x")]}, {"hidden_loss": 3.0}, {"foreign_n": 0},
+    *({"hidden": [replace(DRIVES[0], score=score)]} for score in (1e101, float("nan"), float("-inf"))),
+    *({"drives": [replace(each, figures={"a": figure}) for each in DRIVES]} for figure in (float("nan"), 1.7e308)),
+    {"marks": [float("inf")]}, {"threshold": float("nan")}, {"figures": {"turns": 0.3}}, {"figures": 3.0},
+])  # fmt: skip
+def test_a_report_whose_blind_drives_or_figures_cannot_be_is_refused(tmp_path, changes):
+    path = tmp_path / "report.json"
+    path.write_text(json.dumps({**json.loads(JUDGEMENT.to_json()), **changes}, default=asdict))
+    with pytest.raises(UsageError, match=re.escape(str(path))):
+        read_evaluation_report(path)
 
 
 def test_a_difference_is_paired_by_seed_and_significant_above_two_standard_errors():

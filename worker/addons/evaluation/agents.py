@@ -5,12 +5,13 @@ Pages: trust.md.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from dreamfleet.common.addons.evaluation_report import Sight
 from dreamfleet.common.addons.own_modules import trust_own_run
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
@@ -25,8 +26,6 @@ from dreamfleet.worker.worlds.network_agent import NetworkAgent
 from dreamfleet.worker.worlds.trained_agent import TrainedAgent
 
 Floats = NDArray[np.float32]
-Sight = Literal["own", "hidden", "foreign"]
-"""What an agent sees of what decides an episode: that, nothing of it, or another episode's."""
 Policies = Callable[[int], Policy]
 """A function from an episode's seed to its policy; the caller calls `begin`."""
 
@@ -122,7 +121,7 @@ class EvolvedAgent:
     parameters: Floats = field(repr=False)
     bundle: Bundle | None = None  # of the controller's shape and variant
     known_score: KnownScore | None = None
-    sight: Sight = "own"
+    sight: Sight | None = None  # what it sees of what decides: nothing, or another episode's; `None`: that itself
 
     @property
     def assignment(self) -> Assignment:
@@ -152,7 +151,7 @@ class EvolvedAgent:
     def make_evaluation_environment(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         """Its task's evaluation environment; a task without pictures may have no parameter `render_mode`."""
         task, given = self._task, () if render_mode is None else (render_mode,)
-        if self.sight != "own" and isinstance(reality := self._reality, TaskWithMask):
+        if self.sight is not None and isinstance(reality := self._reality, TaskWithMask):
             return reality.make_masked_environment(self.assignment, foreign=self.sight == "foreign")
         return task.make_evaluation_environment(self.assignment, *given)
 
@@ -185,4 +184,4 @@ def masked(agent: Agent, sight: Sight) -> Agent:
     """The same agent with this sight; `UsageError` if nothing hides in its world what decides."""
     if isinstance(agent, EvolvedAgent) and agent.has_mask:
         return replace(agent, sight=sight)
-    raise UsageError(f"{agent.reality} has no mask over its pictures: evaluate without --blind")
+    raise UsageError(f"{agent.reality} has no mask over its pictures, which --blind needs")

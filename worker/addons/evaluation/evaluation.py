@@ -2,14 +2,14 @@
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from statistics import fmean
 from time import perf_counter
 from typing import Any
 
-from dreamfleet.common.addons.evaluation_report import EvaluationReport
+from dreamfleet.common.addons.evaluation_report import FAILED, SIGHTS, EvaluationReport, Sight
 from dreamfleet.common.cli.progress import progress_bar
 from dreamfleet.common.errors import DreamfleetError, StoppedError
 from dreamfleet.common.host.fingerprint import fingerprint
@@ -20,7 +20,7 @@ from dreamfleet.common.host.stall_watch import STALL_SECONDS
 from dreamfleet.common.host.unseen_drawing import draw_offscreen, draw_unseen
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.function_values import minimises
-from dreamfleet.common.protocol.result_bounds import rejection_reason
+from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS, rejection_reason
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
 from dreamfleet.common.runs.standard_error import format_with_error, standard_error
 from dreamfleet.worker.addons.evaluation.agents import Agent, masked
@@ -92,43 +92,64 @@ def evaluate_in_processes(
 
 
 def judge(
-    name: str, agent: Agent, seeds: tuple[int, ...], jobs: int, note: Callable[[str], object] = log.warning
+    name: str,
+    agent: Agent,
+    seeds: tuple[int, ...],
+    jobs: int,
+    note: Callable[[str], object] = log.warning,
+    how: str = "",
 ) -> EvaluationReport:
     """Drive one whole episode per seed, with a progress bar on stderr; `note` gets a line for each that fails.
 
-    `name` is the agent's in the report. `StoppedError` for a Ctrl-C once an episode has a score: it says the mean of
-    those that have.
+    `name` is the agent's in the report, and `how` says how it drives if not as ever. `StoppedError` for a Ctrl-C once
+    an episode has a score: it says the mean of those that have.
     """
-    began, episodes, values = perf_counter(), list[Episode](), list[float]()
-    minimised = minimises(agent.task, agent.options)
-    with progress_bar("evaluate", len(seeds), "episodes") as bar:
-        try:
-            for each in evaluate_in_processes(agent, seeds, jobs):
-                episodes.append(each)
-                values += [0.0 - each.score if minimised else each.score] if isinstance(each, EpisodeResult) else []
-                bar.update(len(episodes), f"mean {format_with_error(fmean(values), None)}" if values else "")
-                if isinstance(each, FailedEpisode):
-                    note(f"an episode failed: {each}")
-        except KeyboardInterrupt:
-            if not values:
-                raise
-            mean = format_with_error(fmean(values), standard_error(values))
-            raise StoppedError(f"interrupted after {len(values)} of {plural(len(seeds), 'episode')}: {mean}") from None
-    results = EpisodeResults.of(episodes)
+    began = perf_counter()
+    results = EpisodeResults.of(_drive_all(agent, seeds, jobs, note, how))
     return EvaluationReport(
         name=name, fingerprint=fingerprint(agent.world.packages), version=package_version("dreamfleet") or "",
         seconds=perf_counter() - began, drives=results.drives, failed=results.failed, **facts_of(agent),
     )  # fmt: skip
 
 
-def judge_blind(
-    name: str, agent: Agent, seeds: tuple[int, ...], jobs: int, note: Callable[[str], object] = log.warning
-) -> EvaluationReport:
-    """As `judge`, with the same seeds driven blind, and with another episode's sight; `UsageError` without a mask."""
-    blind, misled = masked(agent, "hidden"), masked(agent, "foreign")
-    report = judge(name, agent, seeds, jobs, note)
-    hidden, foreign = (judge(name, each, seeds, jobs, note).drives for each in (blind, misled))
-    return replace(report, hidden=hidden, foreign=foreign)
+def judge_in_passes(
+    name: str, agent: Agent, seeds: tuple[int, ...], jobs: int, note: Callable[[str], object], sights: Iterable[Sight]
+) -> Iterator[EvaluationReport]:
+    """Yield what `judge` gives, then the same with each of `sights` driven too.
+
+    `UsageError` before the first episode if nothing hides in this world what decides.
+    """
+    others = {sight: masked(agent, sight) for sight in sights}
+    yield (report := judge(name, agent, seeds, jobs, note))
+    for sight, other in others.items():
+        episodes = sorted(_drive_all(other, seeds, jobs, note, SIGHTS[sight]), key=lambda each: each.seed)
+        found: dict[str, Any] = {
+            sight: tuple(each for each in episodes if not has_failed(each)),
+            sight + FAILED: tuple(each for each in episodes if has_failed(each)),
+        }
+        yield (report := replace(report, **found))
+
+
+def _drive_all(
+    agent: Agent, seeds: tuple[int, ...], jobs: int, note: Callable[[str], object], how: str
+) -> list[Episode]:
+    episodes, values = list[Episode](), list[float]()
+    minimised, total = minimises(agent.task, agent.options), plural(len(seeds), "episode")
+    with progress_bar(how or "evaluate", len(seeds), "episodes") as bar:
+        try:
+            for each in evaluate_in_processes(agent, seeds, jobs):
+                episodes.append(each)
+                values += [0.0 - each.score if minimised else each.score] if isinstance(each, EpisodeResult) else []
+                bar.update(len(episodes), f"mean {format_with_error(fmean(values), None)}" if values else "")
+                if isinstance(each, FailedEpisode):
+                    note(f"an episode failed{how and f' ({how})'}: {each}")
+        except KeyboardInterrupt:
+            if not values:
+                raise
+            mean = format_with_error(fmean(values), standard_error(values))
+            done = f"interrupted after {len(values)} of {total}{how and f' {how}'}"
+            raise StoppedError(f"{done}: {mean}") from None
+    return episodes
 
 
 def facts_of(agent: Agent) -> dict[str, Any]:
@@ -192,10 +213,18 @@ class DriveStatistics:
     def drive(self, seed: int, score: Score) -> EpisodeResult:
         """The result of the whole episode."""
         finished = bool(self._info.get(self._finish, False)) if self._finish else None
-        figures = {name: float(self._info[name]) for name in self._named if name in self._info} or None
+        said = {name: _number(self._info.get(name)) for name in self._named}
+        figures = {name: value for name, value in said.items() if value is not None} or None
         return EpisodeResult(
             seed, score.fitness, score.steps, finished, _mean(self._speeds), _mean(self._braked), figures
         )
+
+
+def _number(said: Any) -> float | None:
+    """What a world says as a number that a report can hold; `None` for anything else, which costs no score."""
+    with suppress(TypeError, ValueError, OverflowError):
+        return value if abs(value := float(said)) <= LARGEST_FITNESS else None
+    return None
 
 
 def _mean(values: Sequence[float]) -> float | None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dreamfleet.common.addons.analysis.run_archive import find_elite
-from dreamfleet.common.addons.evaluation_report import check_seed_range
+from dreamfleet.common.addons.evaluation_report import SIGHTS, check_seed_range
 from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.global_config import add_global_flags, resolve_network
 from dreamfleet.common.cli.key_values import ENVIRONMENT_EXAMPLE, parse_arguments
@@ -101,7 +101,7 @@ def agent_flags(args: argparse.Namespace) -> tuple[object, ...]:
 
 def run(args: argparse.Namespace) -> int:
     """Drive, and print the scores."""
-    from dreamfleet.worker.addons.evaluation.evaluation import judge, judge_blind
+    from dreamfleet.worker.addons.evaluation.evaluation import judge_in_passes
 
     if args.episodes < 1 or args.first_seed < 0 or args.jobs < 1:
         raise UsageError("--episodes and --jobs must be at least 1, --first-seed at least 0")
@@ -114,11 +114,18 @@ def run(args: argparse.Namespace) -> int:
     if seeds[0] not in TEST or seeds[-1] not in TEST:
         some = "some" if seeds[0] < TEST.stop and seeds[-1] >= TEST.start else "none"
         note(f"note: test seeds are {TEST.start} to {TEST.stop - 1}; {some} of these are among them")
-    judgement = (judge_blind if args.blind else judge)(name, agent, seeds, args.jobs, note)
-    print(judgement.to_json() if args.json else judgement.describe(agent.world.score_word), flush=True)
-    if args.out:
-        with open_output(args.out) as file:
-            file.write(f"{judgement.to_json()}\n".encode())
+    sights, found = (SIGHTS if args.blind else {}), None
+    try:
+        for each in judge_in_passes(name, agent, seeds, args.jobs, note, sights):
+            found = each
+    finally:  # a blind pass that is interrupted or fails takes nothing from those before
+        if found is not None:
+            if missing := [how for sight, how in sights.items() if sight not in found.blind_passes]:
+                note(f"missing below, as not driven to the end: {', '.join(missing)}")
+            print(found.to_json() if args.json else found.describe(agent.world.score_word), flush=True)
+            if args.out:
+                with open_output(args.out) as file:
+                    file.write(f"{found.to_json()}\n".encode())
     if args.controller and args.cell is None:  # a live run's controller, and a cell's, are no file here
         print_next(args, ("record", *agent_flags(args)))
     return 0

@@ -16,7 +16,7 @@ import pytest
 
 import dreamfleet
 from dreamfleet import make_environment, make_policy
-from dreamfleet.common.addons.evaluation_report import EvaluationReport, read_evaluation_report
+from dreamfleet.common.addons.evaluation_report import SIGHTS, EvaluationReport, read_evaluation_report
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
@@ -220,6 +220,70 @@ def test_blind_episodes_stand_beside_those_with_sight(words, tmp_path):
     assert (code, "--blind" in err) == (2, True)
 
 
+def test_blind_episodes_that_fail_are_kept_and_all_passes_have_the_same_seeds(words, random_bundle, tmp_path):
+    out = tmp_path / "report.json"
+    code, said, err = call_here(*words(tasks.VEILED, "--episodes", 4, "--jobs", 1, "--blind", "--out", out))
+    assert code == 0, err
+    assert all(re.search(rf"^{how} .*4/4", err, re.MULTILINE) for how in SIGHTS.values()), err
+    report = read_evaluation_report(out)
+    assert [each.seed for each in report.hidden_failed + report.foreign_failed] == [10_001, 10_002]
+    assert (len(report.drives), len(report.hidden), len(report.foreign)) == (4, 3, 3)
+    figures, plain = report.figures, {each.seed: each.score for each in report.drives}
+    both = [plain[10_000], plain[10_003]]
+    assert (figures["hidden_n"], figures["foreign_n"]) == (2, 2)
+    assert (figures["hidden_mean"], figures["hidden_loss"]) == (pytest.approx(np.mean(both) - 10), pytest.approx(10))
+    assert figures["foreign_mean"] == pytest.approx(np.mean(both) - 20)
+    hidden, foreign = (each.splitlines()[0] for each in report.describe().split("\n")[1:3])
+    assert re.search(r" 2 .*10001", hidden)
+    assert re.search(r" 2 .*10002", foreign)
+    code, said, err = call_here("verify", "report", out, "--bundle", random_bundle.path, "--jobs", 1, "--json")
+    assert (code, json.loads(said)["reproduced"]) == (0, True), err
+    assert len(json.loads(said)["reports"][0]["blind"]) == 2
+
+
+def test_a_blind_pass_that_cannot_be_driven_takes_nothing_from_those_before(words, tmp_path):
+    out, flags = tmp_path / "report.json", ("--episodes", 2, "--jobs", 1, "--blind", "--json")
+    code, said, err = call_here(*words(tasks.HALF_MASKED, *flags, "--out", out))
+    report = read_evaluation_report(out)
+    assert (code, SIGHTS["foreign"] in err, json.loads(said)["n"]) == (2, True, 2)
+    assert (len(report.drives), len(report.hidden), report.foreign) == (2, 2, ())
+    assert (report.figures["hidden_n"], report.figures["foreign_n"]) == (2, None)
+
+
+def test_an_interrupted_blind_pass_takes_nothing_from_those_before(processes, words, monkeypatch, tmp_path):
+    monkeypatch.setenv(rough_tasks.EXIT, "10001")
+    monkeypatch.setenv(rough_tasks.HALT, "10002")
+    out, flags = tmp_path / "report.json", ("--episodes", 4, "--jobs", 1, "--blind", "--trust", rough_tasks.MODULE)
+    task = rough_tasks.name_of(rough_tasks.HaltingWithOthersSight)
+    evaluation = processes.start(*words(task, *flags, "--out", out))
+    evaluation.wait_for("seed 10001")
+    os.killpg(evaluation.popen.pid, signal.SIGINT)
+    assert evaluation.finish()[0] == 130
+    report = read_evaluation_report(out)
+    assert (len(report.drives), len(report.hidden), report.foreign) == (4, 4, ())
+
+
+def test_blind_drives_are_driven_again_and_a_forged_one_is_found(words, random_bundle, tmp_path):
+    out = tmp_path / "report.json"
+    code, _, err = call_here(*words(tasks.MASKED, "--episodes", 3, "--jobs", 1, "--blind", "--out", out))
+    assert code == 0, err
+    recorded = read_evaluation_report(out)
+
+    def verified(report):
+        out.write_text(report.to_json())
+        code, said, _ = call_here("verify", "report", out, "--bundle", random_bundle.path, "--jobs", 1, "--json")
+        return code, said and [each["differing"] for each in json.loads(said)["reports"][0]["blind"]]
+
+    assert verified(recorded) == (0, [[], []])
+    first, *others = recorded.foreign
+    forged = replace(recorded, foreign=(replace(first, score=first.score - 1), *others))
+    assert verified(forged) == (1, [[], [first.seed]])
+    assert verified(replace(recorded, hidden=(), foreign=())) == (0, [])
+    controller_of(random_bundle, tasks.TOY).save(tmp_path / "toy.npz")
+    code, _, _ = call_here(*words(tasks.TOY, "--episodes", 3, "--jobs", 1, "--out", out))
+    assert (code, verified(replace(read_evaluation_report(out), hidden=recorded.hidden))[0]) == (0, 2)
+
+
 def test_an_unwritable_report_is_an_error_before_the_first_episode(words, tmp_path):
     code, _, err = call_here(*words(tasks.HANGING, "--out", tmp_path))
     assert (code, str(tmp_path) in err) == (2, True)
@@ -261,8 +325,24 @@ def test_what_a_world_says_of_an_episode_at_its_end_is_reported_as_a_mean():
         drives.append(watch.drive(seed, Score(5.0, 1)))
     assert [each.figures for each in drives] == [{"turns": 2.0}, None, {"turns": 3.0}]
     report = EvaluationReport("a", "ab", "a", "a", "", "", "", 1.0, tuple(drives))
-    assert report.figures["turns"] == 2.5
+    assert report.figures["figures"] == {"turns": 2.5}
     assert "2.5" in report.describe()
+
+
+@pytest.mark.parametrize("said", [np.nan, np.inf, 1e200, 10**400, None, "a", np.zeros(2), [1]])
+def test_what_is_no_number_of_a_report_is_left_out_and_costs_no_score(said):
+    watch = DriveStatistics(replace(find_task("car-racing").world, figures=("turns", "hits")), None)
+    watch.on_transition(moment({"turns": said, "hits": np.float32(2)}))
+    assert watch.drive(1, Score(5.0, 1)).figures == {"hits": 2.0}
+
+
+def test_a_worlds_figure_may_have_any_name(tmp_path):
+    figures = {"name": 1.0, "mean": 3.0, "above_water": 4.0, "hidden_loss": 5.0, "seeds": 6.0}
+    report = EvaluationReport("a", "ab", "a", "a", "", "", "", 1.0, (EpisodeResult(1, 5.0, 1, figures=figures),))
+    (tmp_path / "report.json").write_text(report.to_json())
+    assert read_evaluation_report(tmp_path / "report.json") == report
+    plain = json.loads(report.to_json())
+    assert (plain["mean"], plain["hidden_loss"], plain["seeds"], plain["figures"]) == (5.0, None, [1], figures)
 
 
 @pytest.mark.parametrize(
