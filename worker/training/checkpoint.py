@@ -1,7 +1,7 @@
 """Checkpoints as safetensors: weights, Adam's moments, and how far training has come. No pickle."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -65,19 +65,12 @@ def load_checkpoint(
 
 def load_config(path: Path, kind: type[T]) -> T:
     """Load the configuration of a checkpoint's model."""
-    try:
-        return from_plain(kind, json.loads(_read_metadata(path)["config"]))
-    except (ValueError, KeyError, TypeError, RecursionError, MalformedError, UsageError) as error:
-        raise DatasetError(f"checkpoint {path} is damaged ({error}); {_remedy(path)}") from error
+    return _read_metadata(path, "config", lambda plain: from_plain(kind, plain))
 
 
 def load_progress(path: Path) -> dict[str, Any]:
     """Load a checkpoint's progress."""
-    try:
-        progress: dict[str, Any] = json.loads(_read_metadata(path)["progress"])
-    except (ValueError, KeyError, RecursionError) as error:
-        raise DatasetError(f"checkpoint {path} is damaged ({error}); {_remedy(path)}") from error
-    return progress
+    return _read_metadata(path, "progress", lambda plain: plain)
 
 
 def _remedy(path: Path) -> str:
@@ -88,9 +81,12 @@ def _remedy(path: Path) -> str:
     return "if another program wrote it, choose another --data; else move it away and train again"
 
 
-def _read_metadata(path: Path) -> Mapping[str, str]:
-    with _open_checkpoint(path) as file:
-        return file.metadata() or {}
+def _read_metadata(path: Path, key: str, read: Callable[[Any], T]) -> T:
+    try:
+        with _open_checkpoint(path) as file:
+            return read(json.loads((file.metadata() or {})[key]))
+    except (ValueError, KeyError, TypeError, RecursionError, MalformedError, UsageError) as error:
+        raise DatasetError(f"checkpoint {path} is damaged ({error}); {_remedy(path)}") from error
 
 
 @contextmanager

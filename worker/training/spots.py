@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 DEVIATIONS = 4.0  # a pixel is of a spot if it is farther from the mean picture than so many mean deviations
 KEPT = 0.5  # share of a spot's deviation that a reconstruction must show
 SIZES = ((5, 16), (17, 64))  # least and most pixels of a class; fewer are mostly noise, more no encoder loses
+BATCH = 100  # pictures at a time: their differences take 100 times the memory of one's
 Pictures = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 
@@ -32,7 +33,8 @@ class Spots(NamedTuple):
 def measure_mean(pictures: Pictures) -> tuple[Floats, float]:
     """The mean picture `(side, side, 3)` of `(N, side, side, 3)`, and the mean of `|x - mean|`, both in bytes."""
     mean = pictures.mean(axis=0, dtype=np.float64)
-    return mean, float(np.abs(pictures - mean).mean())
+    away = [np.abs(each - mean).sum() for each in _in_batches(pictures)]
+    return mean, float(np.sum(away) / max(1, pictures.size))
 
 
 def find_spots(pictures: Pictures, decoded: NDArray[Any], mean: Floats, deviation: float) -> Spots:
@@ -40,7 +42,17 @@ def find_spots(pictures: Pictures, decoded: NDArray[Any], mean: Floats, deviatio
 
     `mean` and `deviation` are those of `measure_mean`.
     """
-    seen, shown = pictures - mean, decoded - mean
+    batches = zip(_in_batches(pictures), _in_batches(decoded), strict=True)
+    found = [_find_in(seen - mean, shown - mean, deviation) for seen, shown in batches]
+    return Spots(*map(np.concatenate, zip(*found, strict=True)))
+
+
+def _in_batches(pictures: NDArray[Any]) -> list[NDArray[Any]]:
+    return [pictures[start : start + BATCH] for start in range(0, max(1, len(pictures)), BATCH)]
+
+
+def _find_in(seen: Floats, shown: Floats, deviation: float) -> Spots:
+    """The spots of a batch, given as differences from the mean picture."""
     labels = _label(np.abs(seen).mean(axis=3) > DEVIATIONS * deviation)
     flat = labels.ravel()
     found, index = np.unique(flat[flat > 0], return_inverse=True)
@@ -57,11 +69,8 @@ def find_spots(pictures: Pictures, decoded: NDArray[Any], mean: Floats, deviatio
 
 def kept_shares(spots: Spots) -> dict[str, float]:
     """The share of the spots of each class that is kept, by name; a class without a spot is left out."""
-    shares = {}
-    for least, most in SIZES:
-        if (kept := spots.of_size(least, most).kept).size:
-            shares[f"kept_of_spots_{least}_to_{most}"] = round(float(kept.mean()), 3)
-    return shares
+    kept = {f"kept_of_spots_{least}_to_{most}": spots.of_size(least, most).kept for least, most in SIZES}
+    return {name: round(float(each.mean()), 3) for name, each in kept.items() if each.size}
 
 
 def _label(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -72,6 +81,6 @@ def _label(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
         for one, other in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[:, :, 1:], np.s_[:, :, :-1])):
             for into, of in ((one, other), (other, one)):
                 np.maximum(labels[into], labels[of], out=labels[into], where=mask[into])
-        labels[mask] = labels.ravel()[labels[mask]]  # the label's own label: parts of any shape need few turns
+        labels[mask] = labels.ravel()[labels[mask]]  # the label's own label: few turns, though more for a spiral
         if np.array_equal(labels, before):
             return labels + 1

@@ -251,6 +251,14 @@ def test_new_begins_anew_and_leaves_nothing_of_the_old_training(drives, data, ca
     assert load_progress(data / train_vae.CHECKPOINT)["update"] == 1
 
 
+def test_layers_of_another_model_are_refused_before_a_bar_is_drawn(data, capsys):
+    train(data, replace(SHORT, updates=1), layers=PLAIN)
+    capsys.readouterr()
+    with pytest.raises(DatasetError, match="latent 4, not 6"):
+        run_verb(verb, "vae", "--data", data, "--set", "latent=6", "channels=2,2,4,4")
+    assert capsys.readouterr().err == ""
+
+
 def test_new_begins_from_a_kept_checkpoint_and_never_from_what_it_replaces(data):
     again = partial(train, data, layers=PLAIN)
     again(replace(SHORT, keep_every=2))

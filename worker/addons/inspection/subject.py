@@ -12,7 +12,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.bundle_store import find_bundle, shipped_names
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import BundleError, ControllerError, JournalError, UsageError
-from dreamfleet.common.files.regular_files import is_file
+from dreamfleet.common.files.regular_files import is_file, path_exists
 from dreamfleet.common.runs.lookup import find_bundle_of, find_controller, load_controller_of
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.worker.scoring.actors import Actor, ControllerActor, Floats
@@ -45,6 +45,8 @@ def find_subject(name: str | None, runs_dir: Path) -> Iterator[InspectionSubject
     if is_file(Path(name)) or name in shipped_names():
         yield InspectionSubject(find_bundle(name))
         return
+    if Path(name).is_dir() and not path_exists(runs_dir / Path(name).name):
+        raise UsageError(f"{name} is a folder and no run: if it holds data, give it by --data")
     try:
         run = open_run(runs_dir, name)
     except JournalError as error:

@@ -114,11 +114,14 @@ def train_model(request: TrainRequest, stop: Stop = never_stop) -> TrainReport:
     from dreamfleet.common.cli.progress import progress_bar
     from dreamfleet.worker.training import train_mdnrnn, train_vae
     from dreamfleet.worker.training.assemble import record_quality
+    from dreamfleet.worker.training.checkpoint import check_config
     from dreamfleet.worker.training.training_state import select_device
 
     config, layers = request.resolve()
     data, name = request.data, SPOKEN[request.model]
     checkpoint = data / (train_vae if request.model == VAE else train_mdnrnn).CHECKPOINT
+    if request.model == VAE and not request.new and checkpoint.exists():
+        check_config(checkpoint, layers)  # before a bar is drawn
     with (
         # a folder without data is none to make
         folder_lock(checkpoint.with_suffix(".lock"), f"training of the {name}") if data.is_dir() else nullcontext(),

@@ -186,6 +186,8 @@ def test_attention_is_that_of_the_trained_model(attentive):
 def test_what_is_missing_is_reported_before_anything_is_driven(tmp_path, attentive):
     with pytest.raises(BundleError, match=r"'nosuch'.*'nosuch'"), find_subject("nosuch", tmp_path):
         pass
+    with pytest.raises(UsageError, match=f"{tmp_path.name}.*--data"), find_subject(str(tmp_path), tmp_path / "runs"):
+        pass
     (tmp_path / "file").write_text("")
     for named, out, data in (("--data", "out", [tmp_path / "nowhere"]), ("--out", "file/out", [])):
         with pytest.raises(DatasetError, match=named):
