@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import gymnasium
 import numpy as np
@@ -43,6 +43,14 @@ class TaskWithTrainedAgents(Protocol):
         """The environment that scores come from, observing the pictures of this name."""
 
 
+@runtime_checkable
+class TaskWithMaskForAgents(Protocol):
+    """Optional: such a task with a twin of that environment, of changed pictures and the same episodes."""
+
+    def make_masked_agent_environment(self, preprocessing: str, *, foreign: bool) -> gymnasium.Env[Any, Any]:
+        """The environment with what decides painted out; if `foreign`, with another episode's in its place."""
+
+
 @dataclass(frozen=True)
 class NetworkAgent:
     """A trained agent from its file; `ControllerError` if it cannot act in its task."""
@@ -52,6 +60,7 @@ class NetworkAgent:
     known_score: ClassVar[None] = None
 
     trained: TrainedAgent
+    sight: Literal["hidden", "foreign"] | None = None  # of what decides; `None`: its own
 
     def __post_init__(self) -> None:
         manifest, task = self.trained.manifest, self._task
@@ -100,7 +109,15 @@ class NetworkAgent:
 
     def make_evaluation_environment(self, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
         """The environment that scores come from, observing this agent's pictures."""
-        return self._task.make_agent_environment(self.trained.manifest.preprocessing, render_mode)
+        task, seen = self._task, self.trained.manifest.preprocessing
+        if self.sight is not None and isinstance(task, TaskWithMaskForAgents):
+            return task.make_masked_agent_environment(seen, foreign=self.sight == "foreign")
+        return task.make_agent_environment(seen, render_mode)
+
+    @property
+    def has_mask(self) -> bool:
+        """Whether its task can hide from such agents what decides."""
+        return isinstance(self._task, TaskWithMaskForAgents)
 
     def make_policies(self) -> Callable[[int], NetworkPolicy]:
         """Return a function that gives the same policy for each episode."""

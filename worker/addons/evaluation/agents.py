@@ -182,6 +182,6 @@ class EvolvedAgent:
 
 def masked(agent: Agent, sight: Sight) -> Agent:
     """The same agent with this sight; `UsageError` if nothing hides in its world what decides."""
-    if isinstance(agent, EvolvedAgent) and agent.has_mask:
+    if isinstance(agent, EvolvedAgent | NetworkAgent) and agent.has_mask:
         return replace(agent, sight=sight)
     raise UsageError(f"{agent.reality} has no mask over its pictures, which --blind needs")

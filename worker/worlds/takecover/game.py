@@ -22,6 +22,7 @@ WALLS, FAR = (16.0, 752.0), 120.0  # where the player's side ends, and how far f
 FAR_TURNS = "share_of_turns_far_from_walls"  # in `info`, once it has turned
 LIMIT = 2100  # tics of an episode at most: a minute
 SKILL = 4  # the one to which published scores fit
+FIREBALL = "DoomImpBall"  # the game's name of one, and of its explosion
 STAY, LEFT, RIGHT = range(3)
 BUTTONS = ([0, 0], [1, 0], [0, 1])  # pressed for each action
 FIRST_ROW, ROWS, COLUMNS = 48, 4, 32  # of the band: its first row in the picture, and its numbers
@@ -34,7 +35,8 @@ Floats = NDArray[np.float32]
 class TakeCover(gymnasium.Env[Pixels, int]):
     """Observes uint8 `(120, 160, 3)`; an action stays, goes left or goes right for `tics` tics; +1 for each tic lived.
 
-    With `screen` it observes what a person sees, `(480, 640, 3)`: the status bar too, and red after a hit.
+    With `screen` it observes what a person sees, `(480, 640, 3)`: the status bar too, and red after a hit. With
+    `labelled` the game says in `fireballs` which pixels are theirs.
 
     `terminated` is a death, `truncated` the limit of 2,100 tics. The picture after a death is the one before it: the
     game itself shows a black one. Equal seeds and actions give equal bits, whatever was played before. A seed of more
@@ -49,18 +51,19 @@ class TakeCover(gymnasium.Env[Pixels, int]):
     render_mode = "rgb_array"
     drawn_by = "vizdoom"
 
-    def __init__(self, tics: int = 1, *, screen: bool = False) -> None:
+    def __init__(self, tics: int = 1, *, screen: bool = False, labelled: bool = False) -> None:
         try:
             import vizdoom
         except ModuleNotFoundError as error:
             remedy = install_command_for("vizdoom")
             raise UsageError(f"Take Cover needs the package vizdoom, which is not here: {remedy}") from error
         self._vizdoom: Any = vizdoom
-        self._tics, self._screen = tics, screen
+        self._tics, self._screen, self._labelled = tics, screen, labelled
         self._game: Any = None
         self._lived = self._turns = self._far_turns = 0
         self._direction = STAY
         self._picture: Pixels = np.zeros((*(SCREEN if screen else (HEIGHT, WIDTH)), 3), np.uint8)
+        self.fireballs: NDArray[np.bool_] | None = None
         if screen:
             self.observation_space = spaces.Box(0, 255, self._picture.shape, np.uint8)
 
@@ -111,6 +114,9 @@ class TakeCover(gymnasium.Env[Pixels, int]):
     def _observe(self) -> Pixels:
         if (state := self._game.get_state()) is not None:
             self._picture = state.screen_buffer
+            if self._labelled:
+                balls = [each.value for each in state.labels if each.object_name == FIREBALL]
+                self.fireballs = np.isin(state.labels_buffer, balls)
         return self._picture
 
     def _start(self) -> Any:
@@ -124,6 +130,7 @@ class TakeCover(gymnasium.Env[Pixels, int]):
         game.set_screen_resolution(sizes.RES_640X480 if self._screen else sizes.RES_160X120)
         game.set_screen_format(vizdoom.ScreenFormat.RGB24)
         game.set_render_hud(self._screen)
+        game.set_labels_buffer_enabled(self._labelled)
         game.set_render_screen_flashes(self._screen)  # red after a hit
         start_game(game, Path(vizdoom.__file__).with_name("vizdoom"))
         return game

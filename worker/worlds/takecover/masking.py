@@ -37,19 +37,24 @@ def _grown(mask: Mask) -> Mask:
 
 def paint_out(picture: Pixels, mask: Mask) -> Pixels:
     """The picture with each pixel of `mask` as the last other one to its left, at the left edge as the first other."""
+    painted, rows = picture.copy(), mask.any(axis=1)
+    picture, mask = picture[rows], mask[rows]  # a screen has many rows without any
     columns = np.where(mask, -1, np.arange(mask.shape[1]))
     source = np.maximum.accumulate(columns, axis=1)
     source = np.where(source < 0, np.argmin(mask, axis=1)[:, None], source)
-    painted: Pixels = np.take_along_axis(picture, source[..., None], axis=1)
+    painted[rows] = np.take_along_axis(picture, source[..., None], axis=1)
     return painted
 
 
 class MaskedTakeCover(gymnasium.Wrapper[Pixels, int, Pixels, int]):
-    """The same game, whose pictures hold no fireballs, or those of `other`, a game in which the same is done."""
+    """The same game, whose pictures hold no fireballs, or those of `other`, a game in which the same is done.
+
+    On the screen that a person sees, where red hides their colours, games say themselves where their fireballs are.
+    """
 
     def __init__(self, game: TakeCover, other: TakeCover | None) -> None:
         super().__init__(game)
-        self._other = other
+        self._game, self._other = game, other
         self._foreign: Pixels | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Pixels, dict[str, Any]]:
@@ -75,8 +80,12 @@ class MaskedTakeCover(gymnasium.Wrapper[Pixels, int, Pixels, int]):
             self._other.close()
 
     def _painted(self, picture: Pixels) -> Pixels:
-        painted = paint_out(picture, find_fireballs(picture))
-        if self._foreign is not None:
-            there = find_fireballs(self._foreign)
+        painted = paint_out(picture, _fireballs_of(self._game, picture))
+        if self._other is not None and self._foreign is not None:
+            there = _fireballs_of(self._other, self._foreign)
             painted[there] = self._foreign[there]
         return painted
+
+
+def _fireballs_of(game: TakeCover, picture: Pixels) -> Mask:
+    return find_fireballs(picture) if game.fireballs is None else game.fireballs

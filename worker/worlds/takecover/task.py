@@ -137,10 +137,12 @@ class TakeCoverTask(Task):
         self, preprocessing: str, render_mode: str | None = None  # noqa: ARG002 - the game always draws
     ) -> gymnasium.Env[Any, Any]:  # fmt: skip
         """The same game as a trained agent sees it: the whole screen in the preprocessing of this name."""
-        seen = self.agent_pictures[preprocessing]
-        space = spaces.Box(0, 255, seen.shape, np.uint8)
-        game = TransformObservation(TakeCover(AGENTS.tics, screen=True), seen.picture, space)
-        return VectorActions(game, CHOICES, pick_choice)
+        return self._seen_by_agent(TakeCover(AGENTS.tics, screen=True), preprocessing)
+
+    def make_masked_agent_environment(self, preprocessing: str, *, foreign: bool) -> gymnasium.Env[Any, Any]:
+        """That without fireballs on its screen, or with those of another game."""
+        game, other = (TakeCover(AGENTS.tics, screen=True, labelled=True) for _ in range(2))
+        return self._seen_by_agent(MaskedTakeCover(game, other if foreign else None), preprocessing)
 
     def make_watched_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
         """Another of the same, whose `render` gives the game's own picture."""
@@ -166,6 +168,11 @@ class TakeCoverTask(Task):
             band = spaces.Box(0, 1, (BAND,), np.float32)
             return self._with_actions(TransformObservation(game, observe_band, band))
         return self._recorded(game, preprocessing_for(assignment.bundle, self).name)
+
+    def _seen_by_agent(self, game: gymnasium.Env[Any, Any], preprocessing: str) -> gymnasium.Env[Any, Any]:
+        seen = self.agent_pictures[preprocessing]
+        space = spaces.Box(0, 255, seen.shape, np.uint8)
+        return VectorActions(TransformObservation(game, seen.picture, space), CHOICES, pick_choice)
 
     def _recorded(self, game: gymnasium.Env[Any, Any], preprocessing: str) -> gymnasium.Env[Any, Any]:
         return self._with_actions(CropAndResize(game, self.preprocessings[preprocessing].size, self._options.part))

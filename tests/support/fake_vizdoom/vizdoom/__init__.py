@@ -19,6 +19,7 @@ ScreenFormat = SimpleNamespace(RGB24="RGB24")
 SET = {
     "set_doom_skill": [4], "set_living_reward": [1], "set_window_visible": [False], "set_render_hud": [False, True],
     "set_screen_format": [ScreenFormat.RGB24], "set_render_screen_flashes": [False, True],
+    "set_labels_buffer_enabled": [False, True],
 }  # fmt: skip
 
 
@@ -76,7 +77,11 @@ class DoomGame:
         if self.is_episode_finished():
             return None
         random = np.random.default_rng([self._seed, self._tic, self._moves])
-        return SimpleNamespace(screen_buffer=random.integers(0, 256, (*self._size, 3), dtype=np.uint8))
+        screen = random.integers(0, 256, (*self._size, 3), dtype=np.uint8)
+        labels = np.zeros(self._size, np.uint8)
+        labels[self._seed % 100 : self._seed % 100 + 20, :9], labels[:, 20] = 3, 4
+        names = [SimpleNamespace(value=3, object_name="DoomImpBall"), SimpleNamespace(value=4, object_name="DoomImp")]
+        return SimpleNamespace(screen_buffer=screen, labels_buffer=labels, labels=names)
 
     def make_action(self, buttons, tics):
         if not self.is_running():

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from dreamfleet.common.cli.command_line import main
-from dreamfleet.worker.addons.evaluation.agents import make_agent
+from dreamfleet.worker.addons.evaluation.agents import make_agent, masked
 from dreamfleet.worker.worlds.trained_agent import TrainedAgent
 from tests.support.doom import use_fake
 
@@ -118,6 +118,20 @@ def test_it_goes_to_other_processes_and_sees_the_whole_screen(agent, monkeypatch
     assert picture.shape == environment.observation_space.shape == (96, 96, 3)
     assert environment.render().shape == (480, 640, 3)
     environment.close()
+
+
+def test_it_is_driven_blind_too(agent, monkeypatch):
+    use_fake(monkeypatch)
+    own = make_agent(TrainedAgent.load(agent))
+    pictures = []
+    for each in (own, masked(own, "hidden"), masked(own, "foreign")):
+        environment = each.make_evaluation_environment()
+        pictures.append(environment.reset(seed=7)[0])
+        environment.close()
+    seen, hidden, foreign = pictures
+    assert seen.shape == hidden.shape == foreign.shape
+    assert not np.array_equal(seen, hidden)
+    assert not np.array_equal(hidden, foreign)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dreamfleet.worker.worlds.takecover.game import TakeCover
-from dreamfleet.worker.worlds.takecover.masking import MaskedTakeCover, find_fireballs, paint_out
+from dreamfleet.worker.worlds.takecover.masking import OTHER_GAME, MaskedTakeCover, find_fireballs, paint_out
 
 WALL, IMP, FIRE, ORANGE = (110, 85, 60), (180, 120, 60), (250, 240, 160), (220, 140, 40)
 
@@ -25,6 +25,10 @@ def test_a_fireball_is_painted_out_and_an_imp_is_not():
     assert (painted[14:] == wall[14:]).all()
 
 
+def screen():
+    return TakeCover(1, screen=True, labelled=True)
+
+
 def play(game, seed):
     pictures, rewards = [game.reset(seed=seed)[0]], []
     for step in range(120):
@@ -35,6 +39,29 @@ def play(game, seed):
             break
     game.close()
     return np.stack(pictures), rewards
+
+
+def test_on_a_screen_the_game_says_what_is_a_fireball(fake_doom):
+    seen, hidden, foreign = (
+        play(game, 7)[0] for game in (screen(), MaskedTakeCover(screen(), None), MaskedTakeCover(screen(), screen()))
+    )
+    other = play(screen(), 7 + OTHER_GAME)[0]
+    mask, there = (np.zeros((480, 640), bool) for _ in range(2))
+    mask[7:27, :9] = there[(7 + OTHER_GAME) % 100 :][:20, :9] = True
+    assert (hidden[:, ~mask] == seen[:, ~mask]).all()
+    assert (hidden[0] == paint_out(seen[0], mask)).all()
+    assert (foreign[0][there] == other[0][there]).all()
+    assert (foreign[:, ~(mask | there)] == seen[:, ~(mask | there)]).all()
+
+
+@pytest.mark.needs_doom
+def test_no_fireball_is_left_on_a_screen_of_the_same_game():
+    seen, rewards = play(screen(), 7)
+    hidden, same = play(MaskedTakeCover(screen(), None), 7)
+    _, again = play(MaskedTakeCover(screen(), screen()), 7)
+    assert rewards == same == again
+    white = [(each[:, :400].min(axis=3) > 150).sum(axis=(1, 2)).max() for each in (seen, hidden)]
+    assert white[1] < 20 < 200 < white[0]  # the eyes of imps
 
 
 @pytest.mark.needs_doom
