@@ -74,13 +74,13 @@ class Dream(gymnasium.Env[Floats, Any]):
         self, bundle: Bundle | str = "tiny", temperature: float = 1.0, horizon: int | None = None,
         render_mode: str | None = None, recorded: float = 0.0, features: str = "z", end: str = "",
     ) -> None:  # fmt: skip
-        self._bundle = open_bundle(bundle)
-        self._world = DreamWorld(self._bundle, temperature, recorded=recorded, end=end)
+        opened = open_bundle(bundle)
+        self._world = DreamWorld(opened, temperature, recorded=recorded, end=end)
         self.metadata = {**self.metadata, "render_fps": self._world.frames_per_second}
-        self._horizon = horizon or self._bundle.manifest.world.horizon
+        self._horizon = horizon or opened.manifest.world.horizon
         self.render_mode = render_mode
-        self._decoder = Decoder(self._bundle) if render_mode else None
-        self._observation = Observation(self._bundle, features)
+        self._decoder = Decoder(opened) if render_mode else None
+        self._observation = Observation(opened, features)
         self.observation_space = self._observation.space
         self.action_space = action_space(self._world.actions)
 
@@ -125,16 +125,12 @@ class VectorDream(gymnasium.vector.VectorEnv[Floats, Any, Any]):
         self, num_envs: int, bundle: Bundle | str = "tiny", temperature: float = 1.0, horizon: int | None = None,
         render_mode: str | None = None, recorded: float = 0.0, features: str = "z", end: str = "",
     ) -> None:  # fmt: skip
-        self._bundle = open_bundle(bundle)
-        self._world = DreamWorld(self._bundle, temperature, recorded=recorded, end=end)
+        one = Dream(bundle, temperature, horizon, render_mode, recorded, features, end)
+        self._world, self._horizon = one._world, one._horizon
+        self._decoder, self._observation = one._decoder, one._observation
         self.metadata = {**self.metadata, "render_fps": self._world.frames_per_second}
-        self._horizon = horizon or self._bundle.manifest.world.horizon
-        self.num_envs = num_envs
-        self.render_mode = render_mode
-        self._decoder = Decoder(self._bundle) if render_mode else None
-        self._observation = Observation(self._bundle, features)
-        self.single_observation_space = self._observation.space
-        self.single_action_space = action_space(self._world.actions)
+        self.num_envs, self.render_mode = num_envs, render_mode
+        self.single_observation_space, self.single_action_space = one.observation_space, one.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
