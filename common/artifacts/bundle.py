@@ -254,14 +254,13 @@ class Bundle(Displayed):
 
 
 def write_bundle(path: Path, manifest: BundleManifest, parts: Mapping[str, bytes]) -> Bundle:
-    """Write a bundle atomically, and open it."""
+    """Write a bundle atomically, and open it; `BundleError` or `OSError`, and no file, for one that `open` refuses."""
     hashes = {name: hashlib.sha256(data).hexdigest() for name, data in sorted(parts.items())}
     text = json.dumps({**to_plain(manifest), "parts": hashes}, indent=1, sort_keys=True)
-    if len(text) > MAX_MANIFEST:
-        raise BundleError(f"the manifest of {path} would have {len(text)} bytes; at most {MAX_MANIFEST} are read")
     with atomic_write(path) as file:
         write_archive(file, [(MANIFEST, text.encode()), *sorted(parts.items())])
-    return Bundle.open(path)
+        file.flush()
+        return Bundle.from_bytes(path, read_regular(Path(file.name), MAX_BUNDLE), None)  # before it replaces another
 
 
 def hash_file(path: Path) -> str:

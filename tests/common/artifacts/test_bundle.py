@@ -11,14 +11,18 @@ import numpy as np
 import onnx
 import pytest
 
+from dreamfleet.common.artifacts import bundle as bundle_module
 from dreamfleet.common.artifacts import bundle_store
 from dreamfleet.common.artifacts.actions import Continuous, one_hot
 from dreamfleet.common.artifacts.bundle import (
     DECODER,
     DREAM_GRAPH,
     ENCODER,
+    INITIAL_LATENTS_PART,
     LINEAR_CONTROLLER,
     MANIFEST,
+    MAX_BUNDLE,
+    MAX_MANIFEST,
     POLICY,
     REQUIRED,
     Bundle,
@@ -107,6 +111,21 @@ def test_an_empty_graph_is_refused_with_its_name(random_bundle, tmp_path, name, 
     parts = parts_of(random_bundle)
     with pytest.raises(BundleError, match=rf"b\.zip.* {name}"):
         write_bundle(tmp_path / "b.zip", random_bundle.manifest, {**parts, name: change(parts[name])})
+
+
+@pytest.mark.parametrize(
+    ("change", "lost", "largest"),
+    [({}, INITIAL_LATENTS_PART, MAX_BUNDLE), ({"actions": 2}, None, MAX_BUNDLE), ({}, None, 1000),
+     ({"provenance": {"x": "x" * MAX_MANIFEST}}, None, MAX_BUNDLE)],
+)  # fmt: skip
+def test_one_that_its_reader_would_refuse_replaces_nothing(change, lost, largest, random_bundle, tmp_path, monkeypatch):
+    shutil.copy(random_bundle.path, path := tmp_path / "b.zip")
+    parts, manifest = without(parts_of(random_bundle), lost), replace(random_bundle.manifest, **change)
+    monkeypatch.setattr(bundle_module, "MAX_BUNDLE", largest)
+    with pytest.raises(OSError if largest < MAX_BUNDLE else BundleError):
+        write_bundle(path, manifest, parts)
+    assert hash_file(path) == random_bundle.sha256
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def without(parts, lost):
