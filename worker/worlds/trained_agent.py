@@ -77,7 +77,12 @@ class TrainedAgent(Displayed):
         return hashlib.sha256(text.encode()).hexdigest()
 
     def save(self, path: Path) -> None:
-        """Write a file that `load` reads, atomically; equal agents give equal files."""
+        """Write a file that `load` reads, atomically; equal agents give equal files.
+
+        `ControllerError`, and no file, for a network that `load` would refuse.
+        """
+        if fault := find_fault(self.network):
+            raise ControllerError(f"{path} was not written: its {NETWORK} {fault}")
         about = {**asdict(self.manifest), "format": FORMAT, "network": hashlib.sha256(self.network).hexdigest()}
         text = json.dumps(about, indent=1, sort_keys=True, allow_nan=False)
         with open_output(path) as file:

@@ -8,7 +8,6 @@ output.
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from onnx import TensorProto
 
 from dreamfleet.common.artifacts.actions import one_hot
@@ -16,6 +15,7 @@ from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.files.archives import read_arrays
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.worlds.shipped import WORLDS
+from dreamfleet.worker.addons.importing.json_weights import Weights, check_range
 from dreamfleet.worker.addons.importing.sources import AGENT_ARRAY, AGENT_LIMITS
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worldmodel.mdnrnn_graph import lstm
@@ -35,7 +35,6 @@ SHAPES = {
     "lstm.weight_hh_l0": (4 * UNITS, UNITS), "lstm.weight_ih_l0": (4 * UNITS, 2 * CHOSEN),
     "out.bias": (1,), "out.weight": (1, UNITS),
 }  # fmt: skip
-Weights = dict[str, NDArray[np.float32]]
 
 
 class _Graph(GraphBuilder):
@@ -60,12 +59,9 @@ def _read_weights(path: Path) -> Weights:
         ends = np.cumsum([np.prod(shape) for shape in SHAPES.values()])
         if numbers.shape != (ends[-1],) or numbers.dtype.kind != "f":
             raise ValueError(f"{numbers.dtype} of shape {numbers.shape}, and an agent has {ends[-1]} floats")
-        numbers = numbers.astype(np.float32)
-        if not np.isfinite(numbers).all():
-            raise ValueError("NaN, infinity, or numbers beyond single precision")
     except (OSError, ValueError, KeyError) as error:
         raise DatasetError(f"{path} holds no weights of AttentionAgent: {error}") from error
-    parts = np.split(numbers, ends[:-1])
+    parts = np.split(check_range(path, numbers), ends[:-1])
     return {name: part.reshape(shape) for part, (name, shape) in zip(parts, SHAPES.items(), strict=True)}
 
 

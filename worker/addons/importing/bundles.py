@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.artifacts.bundle import Bundle, write_bundle
 from dreamfleet.common.errors import DatasetError
+from dreamfleet.common.files.atomic_write import reporting_write_errors
 from dreamfleet.common.host.packages import package_version
 from dreamfleet.common.worlds.shipped import WORLDS
 from dreamfleet.worker.addons.importing import checkpoints
@@ -24,7 +25,6 @@ from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, DataWorld
 from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.training.assemble import export_graphs, make_manifest  # needs the extra `train`
-from dreamfleet.worker.training.data.data_folder import explain_write_errors
 from dreamfleet.worker.training.data.dataset import find_world
 from dreamfleet.worker.training.dream_facts import NO_DRIVES, describe_world
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
@@ -45,11 +45,11 @@ def import_json_model(folder: Path, out: Path) -> Bundle:
     """Write the bundle of a folder with `vae.json` and `rnn.json`, beside `initial_z.json` if it is there.
 
     Without that, dreams begin at a latent of zeros with deviation 1. `DatasetError` names what is missing or does not
-    fit, or a file that cannot be written.
+    fit, `DreamfleetError` a file that cannot be written.
     """
     missing = [name for name in ("vae.json", "rnn.json") if find_json(folder, name) is None]
     if missing:
-        raise DatasetError(f"{folder} lacks {' and '.join(missing)} (also looked for in vae/ and rnn/)")
+        raise DatasetError(f"{folder} lacks {' and '.join(' or '.join(PLACES[name]) for name in missing)}")
     paths = {name: found for name in PLACES if (found := find_json(folder, name)) is not None}
     rnn, layers = read_mdnrnn(paths["rnn.json"])
     config = VAEConfig(latent=layers.latent)
@@ -90,5 +90,5 @@ def _write(
     manifest = make_manifest(out.stem, provenance, facts, vae[1], rnn[1], world, pictures)
     if rnn[1] == ENDING_RNN:  # controllers see the cells too, which follow the hidden state
         manifest = replace(manifest, hidden=2 * manifest.hidden)
-    with explain_write_errors(out):
+    with reporting_write_errors(out):
         return write_bundle(out, manifest, export_graphs(vae[0], rnn[0], initial, vae[1], rnn[1], world))

@@ -23,7 +23,7 @@ from dreamfleet.common.files.archives import ArchiveLimits, DamagedArchiveError,
 from dreamfleet.common.files.regular_files import read_regular
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.printable import one_line
-from dreamfleet.worker.addons.importing.json_weights import Weights
+from dreamfleet.worker.addons.importing.json_weights import Weights, check_range
 from dreamfleet.worker.addons.importing.sources import CONTROLLER, MDRNN, VAE
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
@@ -80,10 +80,7 @@ class _Checkpoint:
             raise DatasetError(f"{self.path}: {name} {found}, and {SOURCE} has {shape} there")
         if not tensor.is_floating_point():
             raise DatasetError(f"{self.path}: {name} is of type {tensor.dtype}, not of floating-point numbers")
-        array = array_of(tensor, self.path)
-        if not np.isfinite(array).all():
-            raise DatasetError(f"{self.path}: {name} holds NaN, infinity, or numbers beyond single precision")
-        return array
+        return check_range(f"{self.path}: {name}", array_of(tensor, self.path))
 
     def configure(self, kind: type[T], **values: Any) -> T:
         """A configuration of these values."""

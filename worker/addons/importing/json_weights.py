@@ -10,6 +10,7 @@ away again: that unit is 0 at the first step and tanh(1) after it.
 
 import json
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -30,12 +31,18 @@ FORGET_BIAS = 1.0  # which TensorFlow's cell adds, and torch's does not
 ENDING_UNITS = 512  # of Doom's, which predicts ends
 ENDING_RNN = MDNRNNConfig(latent=64, actions=1, hidden=ENDING_UNITS + 1, reward="none", done=True, done_weight=10.0)
 OPEN = 40.0  # before a sigmoid or tanh: 1 in single precision
+NO_NUMBERS = re.compile(rb"[^][ \t\r\n,.+\-0-9eE].{,9}", re.DOTALL)  # nothing that lists of numbers hold
+MOST = float(np.finfo(np.float16).max)  # of a weight: a bundle has some in half precision
+MOST_LOGVAR = 20.0  # a deviation of 22,000
 
 
-def read_json(path: Path) -> Any:
-    """The value of a JSON file; `DatasetError` if it is none, or too large."""
+def read_json(path: Path, refused: re.Pattern[bytes] | None = None) -> Any:
+    """The value of a JSON file; `DatasetError` if it is none, is too large, or holds what is `refused`."""
     try:
-        return json.loads(read_regular(path, MOST_BYTES))
+        data = read_regular(path, MOST_BYTES)
+        if refused and (found := refused.search(data)):
+            raise DatasetError(f"{path} must be lists of numbers, and holds {found[0]!r}")
+        return json.loads(data)
     except FileNotFoundError:
         raise DatasetError(f"no file at {path}") from None
     except (OSError, ValueError, RecursionError) as error:
@@ -52,7 +59,7 @@ def read_vae(path: Path, config: VAEConfig) -> Weights:
     flat, latent, first = config.flat, config.latent, config.up[0].inputs
     dense = [((flat, latent), (latent,))] * 2 + [((latent, first), (first,))]
     shapes = [shape for pair in (*down, *dense, *up) for shape in pair]
-    arrays = iter(_to_arrays(path, read_json(path), shapes))
+    arrays = iter(_to_arrays(path, read_json(path, NO_NUMBERS), shapes))
     weights: Weights = {}
     for index in range(len(down)):
         name = f"encoder.{index * config.modules_a_layer}"
@@ -71,7 +78,7 @@ def read_vae(path: Path, config: VAEConfig) -> Weights:
 
 def read_mdnrnn(path: Path) -> tuple[Weights, MDNRNNConfig]:
     """CarRacing's or Doom's MDN-RNN, with torch's names, axes and order of gates; `DatasetError` for other layers."""
-    value = read_json(path)
+    value = read_json(path, NO_NUMBERS)
     first = value[0] if isinstance(value, list) and value else None
     if isinstance(first, list) and len(first) == ENDING_RNN.inputs + 1 + ENDING_UNITS:
         return _to_ending_rnn(path, value), ENDING_RNN
@@ -132,15 +139,16 @@ def _order_of_heads(config: MDNRNNConfig) -> NDArray[np.int64]:
 
 def read_initial_latents(path: Path, latent: int) -> NDArray[np.float32]:
     """The first latents of recorded drives `(N, 2, latent)`, mu and logvar; `DatasetError` for other shapes."""
-    value = read_json(path)
+    value = read_json(path, NO_NUMBERS)
     try:
         mu, logvar = (np.asarray(each, np.float64) / UNIT for each in value)
         if mu.shape != logvar.shape or mu.shape[1:] != (latent,) or not len(mu):
             raise ValueError(f"arrays of {mu.shape} and {logvar.shape}")
-        found = np.stack([mu, logvar], axis=1).astype(np.float32)
+        if logvar.max() > MOST_LOGVAR:
+            raise ValueError(f"a logvar of {logvar.max():g}, and at most {MOST_LOGVAR:g} is read")
     except (ValueError, TypeError, OverflowError) as error:
         raise DatasetError(f"{path} is no list of mu and logvar (N, {latent}): {error}") from error
-    return _finite(path, found)
+    return check_range(path, np.stack([mu, logvar], axis=1))
 
 
 def _to_arrays(path: Path, value: Any, shapes: Sequence[tuple[int, ...]]) -> list[NDArray[np.float32]]:
@@ -157,14 +165,15 @@ def _to_arrays(path: Path, value: Any, shapes: Sequence[tuple[int, ...]]) -> lis
             raise DatasetError(
                 f"{path}: array {number} has the shape {array.shape}, and the paper's layers have {shape} there"
             )
-        arrays.append(_finite(path, (array / UNIT).astype(np.float32)))
+        arrays.append(check_range(path, array / UNIT))
     return arrays
 
 
-def _finite(path: Path, array: NDArray[np.float32]) -> NDArray[np.float32]:
-    if not np.isfinite(array).all():
-        raise DatasetError(f"{path} holds NaN, infinity, or numbers beyond single precision")
-    return array
+def check_range(where: object, numbers: NDArray[Any]) -> NDArray[np.float32]:
+    """The numbers in single precision; `DatasetError` unless sums and products of a few of them are finite there."""
+    if not (np.abs(numbers) <= MOST).all():  # false for NaN too
+        raise DatasetError(f"{where} holds NaN, infinity, or numbers beyond half precision")
+    return numbers.astype(np.float32)
 
 
 def _contiguous(weights: Weights) -> Weights:

@@ -1,10 +1,11 @@
 """What files or folders of other projects hold, by the names in them, and what is not read here; no data are read."""
 
+import sys
 from pathlib import Path
 
 from dreamfleet.common.errors import DatasetError
 from dreamfleet.common.files.archives import ArchiveLimits, DamagedArchiveError, open_archive
-from dreamfleet.common.files.regular_files import open_regular
+from dreamfleet.common.files.regular_files import open_regular, path_exists
 
 PLACES = {  # in a folder of hardmaru/WorldModelsExperiments
     "vae.json": ("vae.json", "vae/vae.json", "tf_models/vae.json"),
@@ -12,13 +13,15 @@ PLACES = {  # in a folder of hardmaru/WorldModelsExperiments
     "initial_z.json": ("initial_z.json", "initial_z/initial_z.json", "tf_models/initial_z.json"),
 }
 CHECKPOINTS = ("best.tar", "checkpoint.tar")  # of ctallec/world-models; the second has the last epoch's weights
-AGENT_ARRAY, AGENT_LIMITS = "params", ArchiveLimits(1 << 20, members=8)  # of AttentionAgent, which has no other array
+AGENT = "model.npz"  # of AttentionAgent
+AGENT_ARRAY, AGENT_LIMITS = "params", ArchiveLimits(1 << 20, members=8)  # which has no other array
+ANY_SIZE = ArchiveLimits(sys.maxsize)  # to read names alone
 VAE, MDRNN, CONTROLLER = "vae", "mdrnn", "ctrl"  # the folders with these
 
 
 def find_json(folder: Path, name: str) -> Path | None:
-    """The file of this name of WME's program in a folder or where its program puts it."""
-    return next((folder / place for place in PLACES[name] if (folder / place).is_file()), None)
+    """What has this name of WME's program, in a folder or where its program puts it."""
+    return next((folder / place for place in PLACES[name] if path_exists(folder / place)), None)
 
 
 def holds_json_model(folder: Path) -> bool:
@@ -28,7 +31,7 @@ def holds_json_model(folder: Path) -> bool:
 
 def find_checkpoint(folder: Path, part: str) -> Path | None:
     """The checkpoint of `vae`, `mdrnn` or `ctrl` in a folder that ctallec's programs call `--logdir`."""
-    return next((folder / part / name for name in CHECKPOINTS if (folder / part / name).is_file()), None)
+    return checkpoint_of(folder / part) if (folder / part).is_dir() else None
 
 
 def holds_checkpoints(folder: Path) -> bool:
@@ -39,18 +42,21 @@ def holds_checkpoints(folder: Path) -> bool:
 def checkpoint_of(source: Path) -> Path | None:
     """The checkpoint that a path names: a `.tar`, or the one in a folder such as `ctrl`; `None` for other sources."""
     if source.is_dir():
-        return next((source / name for name in CHECKPOINTS if (source / name).is_file()), None)
+        return next((source / name for name in CHECKPOINTS if path_exists(source / name)), None)
     return source if source.suffix.lower() == ".tar" else None
 
 
 def find_attention_agent(source: Path) -> Path | None:
-    """The weights of AttentionAgent that a path names: a file, or `model.npz` in a folder; `None` for other sources."""
-    path = source / "model.npz" if source.is_dir() else source
+    """The weights of AttentionAgent that a path names: a file, or `model.npz` in a folder; `None` for other sources.
+
+    What cannot be read is known by that name, unless other files could be drives beside it.
+    """
+    path = source / AGENT if source.is_dir() else source
     try:
-        with open_regular(path) as file, open_archive(file, AGENT_LIMITS) as archive:
+        with open_regular(path) as file, open_archive(file, ANY_SIZE) as archive:
             return path if archive.names == {f"{AGENT_ARRAY}.npy"} else None
     except (OSError, DamagedArchiveError):
-        return None
+        return path if path.name == AGENT and drive_paths(source) == [path] else None
 
 
 def drive_paths(source: Path) -> list[Path]:
@@ -75,6 +81,8 @@ def refuse_unreadable(source: Path) -> None:
     """`DatasetError` with the reason for a file, or folder of files, that cannot be read."""
     if source.is_dir() and any((source / each).is_file() for each in KERAS):
         raise DatasetError(f"{source} cannot be imported: {REASONS['.h5']}")
+    if source.name in PLACES and not source.is_dir():
+        raise DatasetError(f"{source} is a part of a world model: import its folder")
     reason = REASONS.get(source.suffix.lower())
     if reason is not None and source.is_file():
         raise DatasetError(f"{source} cannot be imported: {reason}")

@@ -2,6 +2,8 @@
 Tests bundles.py and json_weights.py."""
 
 import json
+import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +14,9 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.onnx_checks import read_float_array
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
 from dreamfleet.common.cli.command_line import main
-from dreamfleet.worker.addons.importing.json_weights import read_mdnrnn
+from dreamfleet.common.errors import DatasetError
+from dreamfleet.worker.addons.importing.json_weights import read_initial_latents, read_mdnrnn
+from dreamfleet.worker.addons.importing.sources import PLACES, find_json, refuse_unreadable
 from dreamfleet.worker.tasks.registry import find_world
 from dreamfleet.worker.worldmodel.inference import DreamStep
 from tests.support.checkpoint_files import sigmoid
@@ -119,6 +123,48 @@ def test_our_own_vectors_of_such_a_bundle_lie_as_always(bundle, tmp_path):
     assert main(["import", str(tmp_path / "v.npy"), "--bundle", str(bundle.path), "--out", str(out)]) == 0
     assert np.array_equal(Controller.load(out).parameters, vector)
     assert find_bundle(str(bundle.path)).manifest.hidden == 2 * (UNITS + 1)
+
+
+@pytest.mark.parametrize("number", ["3e42", "7e8", "1e300", "1e999", "NaN", "null", "true", '"12"', "{}"])
+def test_what_is_no_weight_is_refused(number, tmp_path):
+    text = json.dumps([np.zeros(shape, int).tolist() for shape in ((578, 2048), (2048,), (512, 961), (961,))])
+    (tmp_path / "rnn.json").write_text(text.replace("0", number, 1))
+    with pytest.raises(DatasetError, match=r"rnn\.json"):
+        read_mdnrnn(tmp_path / "rnn.json")
+
+
+def test_one_that_is_refused_replaces_no_bundle(theirs, tmp_path, capsys):
+    """Its numbers are finite in single precision, and their sums are not."""
+    arrays, path, folder = [each.tolist() for each in theirs[2]], tmp_path / "doom.zip", tmp_path / "tf_models"
+    arrays[0][LATENT + 1] = [3e42] * 4 * UNITS
+    folder.mkdir()
+    (folder / "rnn.json").write_text(json.dumps(arrays))
+    (folder / "vae.json").symlink_to(theirs[0] / "tf_models" / "vae.json")
+    path.write_bytes(b"another")
+    assert main(["import", str(folder), "--out", str(path)]) == 1
+    assert "rnn.json" in capsys.readouterr().err
+    assert path.read_bytes() == b"another"
+
+
+@pytest.mark.parametrize("logvar", ["1e7", "true", '"12"', "NaN"])
+def test_first_latents_without_a_spread_are_refused(logvar, tmp_path):
+    (tmp_path / "initial_z.json").write_text(f"[[[1, 2]], [[3, {logvar}]]]")
+    with pytest.raises(DatasetError, match="initial_z"):
+        read_initial_latents(tmp_path / "initial_z.json", 2)
+
+
+@pytest.mark.parametrize("make", [Path.mkdir, os.mkfifo, lambda path: path.symlink_to("nowhere")])
+def test_first_latents_that_cannot_be_read_are_not_left_out(make, tmp_path):
+    make(tmp_path / "initial_z.json")
+    with pytest.raises(DatasetError, match="initial_z"):
+        read_initial_latents(find_json(tmp_path, "initial_z.json"), LATENT)
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_a_file_of_a_folder_alone_is_not_read(name, tmp_path):
+    (tmp_path / name).write_text("[]")
+    with pytest.raises(DatasetError, match=name):
+        refuse_unreadable(tmp_path / name)
 
 
 def test_doom_s_layers_of_another_size_are_refused(theirs, tmp_path, capsys):
