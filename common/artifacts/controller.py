@@ -240,8 +240,9 @@ class Controller(Displayed):
 
 
 def import_hint(source: Path, *to: object) -> str:
-    """The command that makes something of what another program wrote; by default a controller."""
-    into = to or ("--bundle", "WORLD_MODEL", "--out", "controller.npz")
+    """The command that makes something of what another program wrote; by default a controller, of .npz what it is."""
+    vector = ("--bundle", "WORLD_MODEL", "--out", "controller.npz")
+    into = to or (("--out", "OUT") if source.suffix.lower() == ".npz" else vector)
     return f"`{shell_command('import', source, *into)}` reads what another program wrote"
 
 

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.errors import DatasetError, UsageError
 from dreamfleet.common.files.archives import NPY, ArchiveLimits, DamagedArchiveError, open_archive, parse_array
-from dreamfleet.common.files.atomic_write import atomic_write
+from dreamfleet.common.files.atomic_write import open_output
 from dreamfleet.common.files.regular_files import open_regular
 from dreamfleet.common.printable import plural
 from dreamfleet.worker.addons.importing.sources import drive_paths
 from dreamfleet.worker.scoring.rollout import OF_FIRST_WORLD, write_episode
 from dreamfleet.worker.tasks.recordable import Preprocessing
-from dreamfleet.worker.training.data.data_folder import explain_folder_errors, explain_write_errors, store_preset
+from dreamfleet.worker.training.data.data_folder import explain_folder_errors, store_preset
 from dreamfleet.worker.training.data.dataset import episode_path, existing_episodes, find_world, preprocessing_of_size
 
 LIMITS = ArchiveLimits(512 << 20)  # bytes of a drive: 1,000 pictures of 96x96 as 64-bit numbers have 220 MB
@@ -62,23 +62,23 @@ def import_drives(source: Path, folder: Path, *, layout: Layout | None = None) -
 
     Pictures of 64x64 are taken as they are, and those of 96x96 as whole observations. `layout` says whose drives they
     are; by default each file does, as in `_layout_of`. `UsageError` for a data folder in use, `DatasetError` for a file
-    that is no drive; what was written before it stays.
+    that is no drive; what was written before it stays, and before a first drive nothing is.
     """
     if existing_episodes(folder):
         raise UsageError(f"{folder} holds drives: choose an empty --out")
     paths, layouts = drive_paths(source), set[Layout]()
     if not paths:
         raise DatasetError(f"{source} holds no .npz")
-    with explain_folder_errors(folder):
-        (folder / "episodes").mkdir(parents=True, exist_ok=True)
-    store_preset(folder, "paper", 0)
     steps = rewardless = 0
     for number, path in enumerate(paths):
         drive = read_drive(path, layout=layout)
+        if not number:
+            with explain_folder_errors(folder):
+                (folder / "episodes").mkdir(parents=True, exist_ok=True)
+            store_preset(folder, "paper", 0)
         steps, rewardless = steps + len(drive.arrays["action"]), rewardless + (not drive.has_rewards)
         layouts.add(drive.layout)
-        out = episode_path(folder, number)
-        with explain_write_errors(out), atomic_write(out) as file:
+        with open_output(episode_path(folder, number)) as file:
             write_episode(file, drive.arrays)
     return Imported(len(paths), steps, rewardless, tuple(sorted(layouts)))
 

@@ -82,7 +82,7 @@ def refuse_unreadable(source: Path) -> None:
     if source.is_dir() and any((source / each).is_file() for each in KERAS):
         raise DatasetError(f"{source} cannot be imported: {REASONS['.h5']}")
     if source.name in PLACES and not source.is_dir():
-        raise DatasetError(f"{source} is a part of a world model: import its folder")
+        raise DatasetError(f"{source} is a part of a world model: name its folder")
     reason = REASONS.get(source.suffix.lower())
     if reason is not None and source.is_file():
         raise DatasetError(f"{source} cannot be imported: {reason}")

@@ -79,6 +79,7 @@ def run(args: argparse.Namespace) -> int:
 def _import_world_model(args: argparse.Namespace) -> int:
     from dreamfleet.worker.addons.importing.bundles import import_checkpoints, import_json_model
 
+    _refuse_flags(args, "a world model", "layout", "bundle", "like")
     check_output_path(args.out)
     write = import_checkpoints if sources.holds_checkpoints(args.source) else import_json_model
     bundle = write(args.source, args.out)
@@ -95,18 +96,22 @@ def _import_world_model(args: argparse.Namespace) -> int:
 def _import_agent(args: argparse.Namespace, path: Path) -> int:
     from dreamfleet.worker.addons.importing.attention_agent import import_attention_agent
 
+    _refuse_flags(args, "an agent", "layout", "bundle", "like")
     check_output_path(args.out)
     agent = import_attention_agent(path)
     with reporting_write_errors(args.out):
         agent.save(args.out)
     text = f"{args.out}: {agent}; `{shell_command('evaluate', '--controller', args.out)}` scores it"
-    print_answer(args, text, agent=args.out, sha256=agent.sha256, task=agent.task)
+    not_read = len(sources.drive_paths(args.source)) - 1
+    text += f"; {args.source} holds {not_read} other .npz, which were not read" * bool(not_read)
+    print_answer(args, text, agent=args.out, sha256=agent.sha256, task=agent.task, not_read=not_read)
     return 0
 
 
 def _import_drives(args: argparse.Namespace) -> int:
     from dreamfleet.worker.addons.importing.drives import import_drives
 
+    _refuse_flags(args, "of drives", "bundle", "like")
     found = import_drives(args.source, args.out, layout=args.layout)
     layouts = " and ".join(found.layouts)
     text = f"{args.out}: {plural(found.drives, 'drive')}, {plural(found.steps, 'step')}, read as layout {layouts}; "
@@ -132,6 +137,12 @@ def _import_controller(args: argparse.Namespace) -> int:
     print_answer(args, text, controller=args.out, sha256=controller.sha256, task=controller.task,
            parameters=len(controller.parameters))  # fmt: skip
     return 0
+
+
+def _refuse_flags(args: argparse.Namespace, what: str, *flags: str) -> None:
+    """`UsageError` for flags that such a source does not have."""
+    if given := [f"--{each}" for each in flags if getattr(args, each) is not None]:
+        raise UsageError(f"{args.source} is {what}: omit {' and '.join(given)}")
 
 
 def _read_controller(args: argparse.Namespace) -> Controller:

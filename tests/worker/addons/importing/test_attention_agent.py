@@ -6,13 +6,19 @@ float32. Patches are flattened as (row, column, colour), and ranked by the colum
 
 import json
 import pickle
+import re
+import shlex
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.cli.command_line import main
+from dreamfleet.common.errors import ControllerError
 from dreamfleet.worker.addons.evaluation.agents import make_agent, masked
+from dreamfleet.worker.addons.importing.sources import find_attention_agent
 from dreamfleet.worker.worlds.trained_agent import TrainedAgent
 from tests.support.doom import use_fake
 
@@ -136,13 +142,48 @@ def test_it_is_driven_blind_too(agent, monkeypatch):
 
 @pytest.mark.parametrize(
     "numbers", [np.zeros(3667, np.float32), np.zeros((3633, 1), np.float32), np.full(3633, np.nan, np.float32),
-                np.zeros(3633, int)]
+                np.full(3633, 3e38, np.float32), np.full(3633, 1e300), np.zeros(3633, int)]
 )  # fmt: skip
 def test_other_weights_are_refused(numbers, tmp_path, capsys):
     np.savez(tmp_path / "model.npz", params=numbers)  # CarRacing's file has 3,667 numbers
     assert main(["import", str(tmp_path / "model.npz"), "--out", str(tmp_path / "x.zip")]) == 1
     assert "model.npz" in capsys.readouterr().err
     assert not (tmp_path / "x.zip").exists()
+
+
+def test_a_damaged_file_of_its_name_is_no_drive(file, tmp_path, capsys):
+    file.write_bytes(file.read_bytes()[:-50])
+    for source in (file, file.parent):
+        assert find_attention_agent(source) == file
+        assert main(["import", str(source), "--out", str(tmp_path / "agent.zip")]) == 1
+        assert str(file) in capsys.readouterr().err
+    np.savez(tmp_path / "drive.npz", obs=np.zeros((3, 64, 64, 3), np.uint8), action=np.zeros((3, 3)))
+    assert find_attention_agent(tmp_path) is None
+    assert not (tmp_path / "agent.zip").exists()
+
+
+def test_the_answer_counts_the_other_files_of_its_folder(file, tmp_path, capsys):
+    for number, others in enumerate(("", "drive.npz")):
+        (tmp_path / (others or file.name)).write_bytes(file.read_bytes())
+        assert main(["import", str(tmp_path), "--out", str(tmp_path / f"{number}.zip"), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["not_read"] == number
+
+
+def test_the_advice_on_its_file_works(file, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ControllerError) as caught:
+        Controller.load(file)
+    (command,) = re.findall("`dreamfleet (import [^`]*)`", str(caught.value))
+    assert main(shlex.split(command)) == 0
+    assert TrainedAgent.load(tmp_path / "OUT").manifest.frame_skip == 1
+
+
+def test_an_agent_that_its_reader_would_refuse_replaces_nothing(agent):
+    before, loaded = agent.read_bytes(), TrainedAgent.load(agent)
+    number = np.float32(0.3333).tobytes()
+    with pytest.raises(ControllerError):
+        replace(loaded, network=loaded.network.replace(number, np.float32(np.nan).tobytes())).save(agent)
+    assert agent.read_bytes() == before
 
 
 def test_the_layout_has_as_many_numbers_as_the_public_file():

@@ -1,7 +1,9 @@
 """Vectors of parameters, drives, and checkpoints of ctallec/world-models; what people of another project type first.
 Tests checkpoints.py, drives.py, sources.py, vectors.py and verb.py."""
 
+import errno
 import json
+import os
 import re
 import shlex
 import sys
@@ -18,8 +20,10 @@ from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import ControllerError, DatasetError
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.coordinator.storage.journal import Journal
+from dreamfleet.worker.addons.importing import bundles, drives
 from dreamfleet.worker.addons.importing.checkpoints import read_mdnrnn, read_vae
 from dreamfleet.worker.addons.importing.drives import read_drive
+from dreamfleet.worker.addons.importing.sources import find_checkpoint
 from dreamfleet.worker.addons.importing.vectors import read_vector, to_parameters
 from dreamfleet.worker.training.data.dataset import episode_paths, find_world, kind_of, load_pictures, load_steps
 from dreamfleet.worker.worldmodel.inference import Decoder, DreamStep
@@ -233,6 +237,7 @@ def test_what_is_no_drive_is_refused(arrays, tmp_path, capsys):
     np.savez(tmp_path / "x.npz", **arrays)
     assert take_in(tmp_path / "x.npz", tmp_path / "data") == 1
     assert "x.npz" in capsys.readouterr().err
+    assert not (tmp_path / "data").exists()
 
 
 def test_a_folder_with_drives_is_not_added_to(imported, tmp_path, capsys):
@@ -396,6 +401,20 @@ def test_a_part_of_another_shape_is_refused(taken_in, tmp_path):
         read_vae(tmp_path / "ctrl" / "best.tar")
 
 
+def test_biases_whose_sum_is_infinite_are_refused(taken_in, tmp_path):
+    vae, rnn, controller = taken_in[1]
+    large = {f"rnn.bias_{each}_l0": np.full_like(rnn[f"rnn.bias_{each}_l0"], 3e38) for each in ("ih", "hh")}
+    theirs.write_checkpoints(tmp_path, (vae, {**rnn, **large}, controller))
+    with pytest.raises(DatasetError, match="bias_ih"):
+        read_mdnrnn(tmp_path / "mdrnn" / "best.tar")
+
+
+def test_a_checkpoint_that_cannot_be_read_is_not_left_out(tmp_path):
+    (tmp_path / "vae" / "best.tar").mkdir(parents=True)
+    (tmp_path / "vae" / "checkpoint.tar").touch()
+    assert find_checkpoint(tmp_path, "vae") == tmp_path / "vae" / "best.tar"
+
+
 WME, ARTICLE, CTALLEC = "log/best.json", "controller/car_racing.cma.4.32.best.json", "exp_dir/ctrl/best.tar"
 DRIVES = ("record", "rollout", "datasets/carracing")
 TRAIN = "train vae --data data --preset paper"
@@ -480,6 +499,33 @@ def written_by(name, folder):
     if name.endswith(".npz"):
         return Controller.load(path).shape.size == 867
     return Bundle.open(path).manifest.latent == 32 if name.endswith(".zip") else any((path / "episodes").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("source", "flags"), [("exp_dir", ("layout", "bundle", "like")), ("agent.npz", ("layout", "bundle", "like")),
+                          ("record", ("bundle", "like"))]
+)  # fmt: skip
+def test_flags_that_a_source_does_not_have_are_refused(source, flags, sources, tmp_path, capsys):
+    np.savez(sources / "agent.npz", params=np.zeros(3))
+    for flag in flags:
+        value = "wme" if flag == "layout" else "tiny"
+        assert main(["import", str(sources / source), f"--{flag}", value, "--out", str(tmp_path / "x")]) == 2
+        assert f"--{flag}" in capsys.readouterr().err
+        assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("module", "writer", "source"), [(bundles, "write_bundle", "exp_dir"), (drives, "write_episode", "record")]
+)
+def test_a_disk_that_is_full_asks_for_another_out(module, writer, source, sources, tmp_path, monkeypatch, capsys):
+    def fail(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(module, writer, fail)
+    assert take_in(sources / source, tmp_path / "x") == 1
+    answer = capsys.readouterr().err
+    assert "--out" in answer
+    assert "--new" not in answer
 
 
 def test_no_file_of_the_source_is_replaced(sources, monkeypatch, capsys):
