@@ -7,7 +7,6 @@ as `worker.17`: the certificate's common name, or the user name with passwords. 
 
 import hashlib
 import hmac
-import json
 import os
 import stat
 import tomllib
@@ -171,21 +170,3 @@ def _parse_credentials(path: Path, document: dict[str, Any]) -> Credentials:
     if not (has_certificate or credentials.password) or (credentials.can_listen and not has_certificate):
         raise AccessError(f"{path} is not a join file: its certificate, key or password is missing")
     return credentials
-
-
-def format_join_file(credentials: Credentials) -> str:
-    """Format credentials as the text of a join file."""
-    note = f"this file is the secret of {credentials.role} {credentials.name}. Do not share it."
-    lines = [
-        f"# dreamfleet: {note}",
-        f"version = {VERSION}",
-        f'role = "{credentials.role}"',
-        f"seat = {credentials.seat}",
-        f'name = "{credentials.name}"',
-        f"expires = {credentials.expires:%Y-%m-%dT%H:%M:%SZ}",
-        f"connect = {json.dumps(credentials.connect)}",
-    ]
-    secret = {name: f'"{getattr(credentials, name)}"' for name in ("password", "secret")}
-    pem = {name: f'"""\n{getattr(credentials, name)}"""' for name in ("ca", "certificate", "key")}
-    lines.extend(f"{name} = {text}" for name, text in {**secret, **pem}.items() if getattr(credentials, name))
-    return "\n".join(lines) + "\n"

@@ -34,7 +34,7 @@ from dreamfleet.common.files.locks import open_lock, wait_for_lock
 from dreamfleet.common.files.regular_files import others_write, read_regular, read_text
 from dreamfleet.common.protocol.keys import check_worker_name
 from dreamfleet.common.security.certificate_ledger import LEDGER_FILE, MAX_BYTES, CertificateLedger, IssuedJoinFile
-from dreamfleet.common.security.credentials import SEATS, Credentials, derive_password, format_join_file, hash_authority
+from dreamfleet.common.security.credentials import SEATS, VERSION, Credentials, derive_password, hash_authority
 
 AUTHORITY_DAYS = 3650  # validity of the authority's certificate
 # The help of verb.py's --days has these too.
@@ -196,6 +196,24 @@ def with_revoked(ledger: CertificateLedger, wanted: Iterable[IssuedJoinFile], no
     chosen = set(wanted)
     return replace(ledger, issued=tuple(replace(each, revoked=now) if each in chosen else each
                                         for each in ledger.issued))  # fmt: skip
+
+
+def format_join_file(credentials: Credentials) -> str:
+    """Format credentials as the text of a join file."""
+    note = f"this file is the secret of {credentials.role} {credentials.name}. Do not share it."
+    lines = [
+        f"# dreamfleet: {note}",
+        f"version = {VERSION}",
+        f'role = "{credentials.role}"',
+        f"seat = {credentials.seat}",
+        f'name = "{credentials.name}"',
+        f"expires = {credentials.expires:%Y-%m-%dT%H:%M:%SZ}",
+        f"connect = {json.dumps(credentials.connect)}",
+    ]
+    secret = {name: f'"{getattr(credentials, name)}"' for name in ("password", "secret")}
+    pem = {name: f'"""\n{getattr(credentials, name)}"""' for name in ("ca", "certificate", "key")}
+    lines.extend(f"{name} = {text}" for name, text in {**secret, **pem}.items() if getattr(credentials, name))
+    return "\n".join(lines) + "\n"
 
 
 def _parts(folder: Path) -> list[str]:

@@ -24,7 +24,7 @@ import pytest
 import zenoh
 
 from dreamfleet.common.addons.access import authority
-from dreamfleet.common.addons.access.authority import Authority, save_ledger, with_revoked
+from dreamfleet.common.addons.access.authority import Authority, format_join_file, save_ledger, with_revoked
 from dreamfleet.common.addons.doctor.health import _check_join_file
 from dreamfleet.common.addons.router import verb as router
 from dreamfleet.common.cli.command_line import main
@@ -36,7 +36,6 @@ from dreamfleet.common.security.credentials import (
     MAX_BYTES,
     SEATS,
     add_seat_to_name,
-    format_join_file,
     issue_command,
     read_join_file,
     worker_seat_identity,
