@@ -3,16 +3,12 @@
 Journal, wire, JSON and tables for programs hold fitness; text, pictures and pages show values. Pages: tasks.md.
 """
 
-import math
-from collections.abc import Iterable, Sequence
 from functools import lru_cache
 
 from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import is_function_task
-
-TWO_DECADES = 100  # docs/tutorials/own-objective.md says when an axis is logarithmic
 
 
 def is_minimised(task: TaskSpec) -> bool:
@@ -41,18 +37,3 @@ def fitness_word(task: TaskSpec) -> str:
 def value_of(fitness: float, task: TaskSpec) -> float:
     """The function's value of a fitness; of any other task the fitness."""
     return 0.0 - fitness if is_minimised(task) else fitness  # of zero no negative one
-
-
-def spans_decades(values: Sequence[float]) -> bool:
-    """Whether an axis of these values is better logarithmic: none is negative, and others than 0 span over two decades.
-
-    >>> spans_decades([0.001, 1.0]), spans_decades([0.5, 1.0]), spans_decades([0.0, 0.001, 1.0])
-    (True, False, True)
-    """
-    known = [each for each in values if not math.isnan(each)]
-    return bool(known) and min(known) >= 0 and max(known) > TWO_DECADES * least_positive(known)
-
-
-def least_positive(values: Iterable[float]) -> float:
-    """The foot of a logarithmic axis, on which 0 is drawn; infinity if no value is above 0."""
-    return min((each for each in values if each > 0), default=math.inf)

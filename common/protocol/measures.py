@@ -96,27 +96,6 @@ def parse_axes(texts: Sequence[str]) -> tuple[Axis, ...]:
     return axes
 
 
-def describe_measure(name: str) -> str:
-    """A measure's name with what it is and its unit, for the axis of a picture.
-
-    >>> describe_measure("brake.share")
-    'brake.share (share of the steps in which it is above 0, from 0 to 1)'
-    """
-    if name == STEPS:
-        return "steps (length of the episode, in steps)"
-    if name.startswith(INFO):
-        return f"{name} (of the last step, in the environment's unit)"
-    if name.startswith(TRUTH):
-        return f"{name} (mean over the steps, in the task's unit)"
-    action, _, kind = name.partition(".")
-    means = {
-        "": "mean over the steps, or a numbered action's share",
-        "abs": "mean magnitude over the steps, in the action's unit",
-        "share": "share of the steps in which it is above 0, from 0 to 1",
-    }
-    return f"{action}{'.' if kind else ''}{kind} ({means.get(kind, 'mean')})"
-
-
 def check_dreamt(names: Sequence[str]) -> None:
     """`UsageError` for measures of the world itself, which no dream has."""
     if real := [name for name in names if name.startswith((INFO, TRUTH))]:

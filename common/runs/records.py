@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Annotated, Any, Literal, TypeVar, cast
 
@@ -299,29 +298,6 @@ S = TypeVar("S", bound=Scored | None)
 def best_evaluation(evaluations: Iterable[StoredEvaluation]) -> StoredEvaluation | None:
     """The evaluation of the highest rank, the first of equal ones; `None` if there are none."""
     return max(evaluations, key=lambda each: each.rank, default=None)
-
-
-def expand_task_options(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Plain settings for display: the task's JSON options parsed, and the controller's shape only once."""
-    task = dict(settings.get("task", {}))
-    with suppress(ValueError):
-        task["options"] = json.loads(task.get("options") or "{}")
-    if task.get("controller") == settings.get("controller"):
-        task.pop("controller", None)
-    return {**settings, "task": task}
-
-
-def count_failed(history: Iterable[StoredGeneration]) -> int:
-    """Candidates of closed generations that failed and have no fitness."""
-    return sum(each.failed for each in history)
-
-
-def describe_failed(settings: RunSettings, history: Sequence[StoredGeneration], reseeds: int) -> str:
-    """How many candidates failed, the setting that says what becomes of them, and how many sets of seeds failed."""
-    found = f"{count_failed(history)} in {plural(len(history), 'closed generation')}"
-    found += f" (--on-failure {settings.on_failure})"
-    sets = plural(reseeds, "set of seeds", "sets of seeds")
-    return f"{found}; {sets} replaced, because all candidates failed" if reseeds else found
 
 
 def with_error(found: StoredEvaluation | StoredConfirmation) -> dict[str, Any]:

@@ -2,10 +2,8 @@
 
 import os
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-from dreamfleet.common.errors import JournalError
 from dreamfleet.common.files.regular_files import is_folder
 from dreamfleet.common.host.processes import shell_command
 
@@ -54,20 +52,3 @@ def trust_flag(modules: Iterable[str]) -> tuple[str, ...]:
     """The flag that has a command trust these modules, each once; none without a module."""
     named = tuple(dict.fromkeys(filter(None, modules)))
     return ("--trust", *named) if named else ()
-
-
-def check_movable(folder: Path) -> None:
-    """`JournalError` if a run's folder is a symbolic link or holds other runs: it must not be moved or deleted."""
-    if folder.is_symlink():
-        raise JournalError(f"{folder} is a link: move or delete what it leads to by hand")
-    if inside := ", ".join(each.name for each in run_paths(folder)):
-        raise JournalError(f"{folder} holds other runs ({inside}): move them away first")
-
-
-@contextmanager
-def reporting_folder_errors(folder: Path) -> Iterator[None]:
-    """Turn an `OSError` while moving or deleting a run's folder into a `JournalError`."""
-    try:
-        yield
-    except OSError as error:
-        raise JournalError(f"{folder} cannot be moved or deleted: {error.strerror or error}") from error

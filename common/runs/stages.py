@@ -154,18 +154,6 @@ def stage_at(
     return StageTracker(settings).advance_to(generation, history, finished)
 
 
-def describe_stages(settings: RunSettings, begun: Sequence[BegunStage]) -> dict[str, str]:
-    """Describe each stage of a schedule and when it began, by the stage's name."""
-    found, first = {}, {each.stage.number: each for each in begun}
-    for stage in stages_of(settings) if settings.stages else ():
-        if stage.number not in first and stage.number < max(first, default=0):
-            found[f"stage {stage.number}"] = "left out"
-            continue
-        since = first[stage.number].beginning if stage.number in first else "not begun"
-        found[f"stage {stage.number}"] = f"{since}, {stage.end_condition}: {stage.description}"
-    return found
-
-
 def describe_steps(horizon: int, driven: float, *, dreamt: bool, limit: int | None = None, word: str = "steps") -> str:
     """Describe the steps of a candidate's episodes; in a dream task also the share in reality.
 

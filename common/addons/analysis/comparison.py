@@ -7,7 +7,9 @@ Pages: dashboard.md.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +19,7 @@ from dreamfleet.common.protocol.function_values import is_minimised, value_of
 from dreamfleet.common.protocol.tasks import is_function_task
 from dreamfleet.common.runs.effort import Effort
 from dreamfleet.common.runs.paired_difference import PairedDifference
-from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, expand_task_options, in_values
+from dreamfleet.common.runs.records import RunSettings, StoredConfirmation, in_values
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.schema.validation import to_plain
 
@@ -123,6 +125,16 @@ def differing_values(sides: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]
         for name, values in rows.items()
         if any(value != values[0] for value in values) and not (name.startswith(STATISTICS) and None not in values)
     }
+
+
+def expand_task_options(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain settings for display: the task's JSON options parsed, and the controller's shape only once."""
+    task = dict(settings.get("task", {}))
+    with suppress(ValueError):
+        task["options"] = json.loads(task.get("options") or "{}")
+    if task.get("controller") == settings.get("controller"):
+        task.pop("controller", None)
+    return {**settings, "task": task}
 
 
 def are_comparable(sides: Sequence[ComparedRun]) -> bool:

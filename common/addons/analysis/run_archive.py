@@ -14,7 +14,7 @@ from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.client.elite_archive import Elite, EliteArchive
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import format_number
-from dreamfleet.common.protocol.measures import Axis
+from dreamfleet.common.protocol.measures import INFO, STEPS, TRUTH, Axis
 from dreamfleet.common.runs.records import RunSettings
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 
@@ -163,3 +163,24 @@ def tables(archive: RunArchive) -> tuple[list[str], list[dict[str, Any]]]:
         for elite in archive.elites.values()
     ]  # fmt: skip
     return [*cells, *names, "fitness", "generation", "candidate"], rows
+
+
+def describe_measure(name: str) -> str:
+    """A measure's name with what it is and its unit, for the axis of a picture.
+
+    >>> describe_measure("brake.share")
+    'brake.share (share of the steps in which it is above 0, from 0 to 1)'
+    """
+    if name == STEPS:
+        return "steps (length of the episode, in steps)"
+    if name.startswith(INFO):
+        return f"{name} (of the last step, in the environment's unit)"
+    if name.startswith(TRUTH):
+        return f"{name} (mean over the steps, in the task's unit)"
+    action, _, kind = name.partition(".")
+    means = {
+        "": "mean over the steps, or a numbered action's share",
+        "abs": "mean magnitude over the steps, in the action's unit",
+        "share": "share of the steps in which it is above 0, from 0 to 1",
+    }
+    return f"{action}{'.' if kind else ''}{kind} ({means.get(kind, 'mean')})"

@@ -7,12 +7,14 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
-from dreamfleet.common.protocol.function_values import is_minimised, least_positive, spans_decades
+from dreamfleet.common.protocol.function_values import is_minimised
 from dreamfleet.common.protocol.messages import TaskSpec
 from dreamfleet.common.protocol.tasks import DREAM
 from dreamfleet.common.runs.records import StoredEvaluation, StoredGeneration
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.stages import BegunStage, describe_steps, join_distinct
+
+TWO_DECADES = 100  # docs/tutorials/own-objective.md says when an axis is logarithmic
 
 
 def scored_history(run: RunFolder, since: int = 0) -> list[StoredGeneration]:
@@ -33,6 +35,21 @@ def log_foot(
     """
     values = [value for each in history for value in (each.best, each.mean)] + [each.mean for each in evaluations]
     return least_positive(values) if is_minimised(task) and spans_decades(values) else None
+
+
+def spans_decades(values: Sequence[float]) -> bool:
+    """Whether an axis of these values is better logarithmic: none is negative, and others than 0 span over two decades.
+
+    >>> spans_decades([0.001, 1.0]), spans_decades([0.5, 1.0]), spans_decades([0.0, 0.001, 1.0])
+    (True, False, True)
+    """
+    known = [each for each in values if not math.isnan(each)]
+    return bool(known) and min(known) >= 0 and max(known) > TWO_DECADES * least_positive(known)
+
+
+def least_positive(values: Iterable[float]) -> float:
+    """The foot of a logarithmic axis, on which 0 is drawn; infinity if no value is above 0."""
+    return min((each for each in values if each > 0), default=math.inf)
 
 
 def spread_of(row: StoredGeneration) -> tuple[float, float]:

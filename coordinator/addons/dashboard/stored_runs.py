@@ -8,23 +8,16 @@ from math import isnan
 from pathlib import Path
 from typing import Any
 
+from dreamfleet.common.addons.analysis.comparison import expand_task_options
 from dreamfleet.common.addons.analysis.learning import efforts_until, world_of
-from dreamfleet.common.addons.analysis.run_archive import RunArchive
+from dreamfleet.common.addons.analysis.run_archive import RunArchive, describe_measure
 from dreamfleet.common.addons.analysis.scored_history import scored_history
 from dreamfleet.common.client.run_view import RunView
 from dreamfleet.common.errors import DreamfleetError, JournalError
 from dreamfleet.common.printable import format_duration, printable
-from dreamfleet.common.protocol.measures import describe_measure
 from dreamfleet.common.protocol.tasks import is_function_task
 from dreamfleet.common.runs.effort import Effort, format_steps
-from dreamfleet.common.runs.records import (
-    RunSettings,
-    StoredGeneration,
-    count_failed,
-    expand_task_options,
-    format_mean,
-    in_values,
-)
+from dreamfleet.common.runs.records import RunSettings, StoredGeneration, format_mean, in_values
 from dreamfleet.common.runs.run_folder import RunFolder, open_run
 from dreamfleet.common.runs.run_paths import resume_command, run_paths
 from dreamfleet.common.runs.stages import stages_of
@@ -32,7 +25,7 @@ from dreamfleet.common.schema.times import format_time, parse_time
 from dreamfleet.coordinator.addons.dashboard.curves import Quartiles, RunData, curves, downsample
 from dreamfleet.coordinator.addons.dashboard.host_history import host_history
 from dreamfleet.coordinator.addons.dashboard.page_state import NONE, Facts, tile
-from dreamfleet.coordinator.addons.runs.run_details import run_row, setting_rows, view_of
+from dreamfleet.coordinator.addons.runs.run_details import count_failed, run_row, setting_rows, view_of
 
 LAST = 20  # generations in the table
 MOST_READ = 256 << 20  # bytes of candidates that are read for quartiles

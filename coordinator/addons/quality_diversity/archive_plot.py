@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from dreamfleet.common.addons.analysis.run_archive import RunArchive
+from dreamfleet.common.addons.analysis.run_archive import RunArchive, describe_measure
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.printable import format_number
-from dreamfleet.common.protocol.measures import Axis, describe_measure
+from dreamfleet.common.protocol.measures import Axis
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.coordinator.addons.runs.plot import TITLE, ShownFigure
 

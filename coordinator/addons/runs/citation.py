@@ -15,15 +15,15 @@ from dreamfleet.common.errors import BundleError
 from dreamfleet.common.printable import format_duration, one_line, plural
 from dreamfleet.common.protocol.tasks import module_of
 from dreamfleet.common.runs.lookup import load_controller_of
-from dreamfleet.common.runs.records import SUBMITTED, RunSettings, count_failed, describe_failed
+from dreamfleet.common.runs.records import SUBMITTED, RunSettings
 from dreamfleet.common.runs.run_folder import RunFolder
 from dreamfleet.common.runs.run_paths import trust_flag
 from dreamfleet.common.runs.run_provenance import RunProvenance, read_run_provenance, read_run_settings
 from dreamfleet.common.runs.seeds import TRAINING_FIRST
-from dreamfleet.common.runs.stages import begun_stages, describe_stages
+from dreamfleet.common.runs.stages import begun_stages
 from dreamfleet.common.schema.times import parse_time
 from dreamfleet.common.schema.validation import to_plain
-from dreamfleet.coordinator.addons.runs.run_details import view_of
+from dreamfleet.coordinator.addons.runs.run_details import count_failed, describe_failed, describe_stages, view_of
 
 AUTHORS = "The dreamfleet authors"  # as in CITATION.cff
 

@@ -26,12 +26,11 @@ from dreamfleet.common.addons.analysis.fitness_chart import (
 )
 from dreamfleet.common.addons.analysis.learning import LearningCurve
 from dreamfleet.common.addons.analysis.run_archive import RunArchive, exploration_note
-from dreamfleet.common.addons.analysis.scored_history import effort_axes, goal_of, steps_text, value_axis
+from dreamfleet.common.addons.analysis.scored_history import effort_axes, goal_of, spans_decades, steps_text, value_axis
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import open_output
 from dreamfleet.common.host.add_ons import add_on
 from dreamfleet.common.printable import plural
-from dreamfleet.common.protocol.function_values import spans_decades
 from dreamfleet.common.protocol.tasks import is_function_task
 from dreamfleet.common.runs.effort import Effort, format_steps
 from dreamfleet.common.runs.records import SUBMITTED

@@ -5,7 +5,7 @@ Pages: quality-diversity.md, own-objective.md, trust.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -18,7 +18,7 @@ from dreamfleet.common.artifacts.objective import Objective
 from dreamfleet.common.client.equal_fitness import EqualFitness
 from dreamfleet.common.client.run_view import RunView
 from dreamfleet.common.errors import DreamfleetError, JournalError
-from dreamfleet.common.printable import format_duration, format_number, format_setting
+from dreamfleet.common.printable import format_duration, format_number, format_setting, plural
 from dreamfleet.common.protocol.function_values import value_of
 from dreamfleet.common.protocol.tasks import DREAM, is_function_task
 from dreamfleet.common.runs.lookup import load_controller_of
@@ -26,13 +26,11 @@ from dreamfleet.common.runs.records import (
     RunSettings,
     StoredGeneration,
     best_evaluation,
-    count_failed,
-    describe_failed,
     in_values,
     with_error,
 )
 from dreamfleet.common.runs.run_folder import RunFolder
-from dreamfleet.common.runs.stages import begun_stages, describe_stages
+from dreamfleet.common.runs.stages import BegunStage, begun_stages, stages_of
 from dreamfleet.common.worlds.score_words import score_word_of_run
 from dreamfleet.coordinator.addons.runs.export import rows_of
 from dreamfleet.coordinator.settings.config import DEFAULT_HORIZON, RunConfig
@@ -136,6 +134,31 @@ def run_facts(run: RunFolder) -> dict[str, Any]:
         begun = begun_stages(settings, history, run.evaluations())
         facts |= {"stage": f"{begun[-1].stage.number} of {len(settings.stages)}", **describe_stages(settings, begun)}
     return facts
+
+
+def count_failed(history: Iterable[StoredGeneration]) -> int:
+    """Candidates of closed generations that failed and have no fitness."""
+    return sum(each.failed for each in history)
+
+
+def describe_failed(settings: RunSettings, history: Sequence[StoredGeneration], reseeds: int) -> str:
+    """How many candidates failed, the setting that says what becomes of them, and how many sets of seeds failed."""
+    found = f"{count_failed(history)} in {plural(len(history), 'closed generation')}"
+    found += f" (--on-failure {settings.on_failure})"
+    sets = plural(reseeds, "set of seeds", "sets of seeds")
+    return f"{found}; {sets} replaced, because all candidates failed" if reseeds else found
+
+
+def describe_stages(settings: RunSettings, begun: Sequence[BegunStage]) -> dict[str, str]:
+    """Describe each stage of a schedule and when it began, by the stage's name."""
+    found, first = {}, {each.stage.number: each for each in begun}
+    for stage in stages_of(settings) if settings.stages else ():
+        if stage.number not in first and stage.number < max(first, default=0):
+            found[f"stage {stage.number}"] = "left out"
+            continue
+        since = first[stage.number].beginning if stage.number in first else "not begun"
+        found[f"stage {stage.number}"] = f"{since}, {stage.end_condition}: {stage.description}"
+    return found
 
 
 def _equal_fitness(settings: RunSettings, history: Sequence[StoredGeneration]) -> EqualFitness:

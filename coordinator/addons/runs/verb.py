@@ -4,7 +4,8 @@ import argparse
 import json
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from dreamfleet.common.printable import format_number, plural
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_lock import run_lock
 from dreamfleet.common.runs.run_paths import ARCHIVE as ARCHIVE_FOLDER
-from dreamfleet.common.runs.run_paths import check_movable, reporting_folder_errors, resume_command, run_paths
+from dreamfleet.common.runs.run_paths import resume_command, run_paths
 from dreamfleet.common.runs.standard_error import format_with_error
 from dreamfleet.common.transport.network import SECURED_PREFIX
 from dreamfleet.coordinator.addons.runs.backup import back_up
@@ -118,8 +119,8 @@ def archive_run(args: argparse.Namespace) -> int:
     source, target = args.runs_dir / args.run_name, args.runs_dir / ARCHIVE_FOLDER / args.run_name
     if target.exists():
         raise JournalError(f"{target} exists; rename it first")
-    check_movable(source)
-    with run_lock(source), reporting_folder_errors(source):
+    _check_movable(source)
+    with run_lock(source), _reporting_folder_errors(source):
         target.parent.mkdir(exist_ok=True)
         source.rename(target)
     print_answer(args, f"archived as {target}; move it back to use it again", run=args.run_name, archived=target)
@@ -169,8 +170,8 @@ def delete_run(args: argparse.Namespace) -> int:
             print_answer(args, "kept", run=args.run_name, deleted=None)
             return 1
     folder = args.runs_dir / args.run_name
-    check_movable(folder)
-    with run_lock(folder), reporting_folder_errors(folder):
+    _check_movable(folder)
+    with run_lock(folder), _reporting_folder_errors(folder):
         shutil.rmtree(folder)
     print_answer(args, f"deleted {folder}", run=args.run_name, deleted=folder)
     return 0
@@ -201,6 +202,23 @@ def export_run(args: argparse.Namespace) -> int:
     text = "\n".join(map(str, written)) if written else f"run {args.run_name} has no row yet: nothing was written"
     print_answer(args, text, run=args.run_name, files=written)
     return 0
+
+
+def _check_movable(folder: Path) -> None:
+    """`JournalError` if a run's folder is a symbolic link or holds other runs: it must not be moved or deleted."""
+    if folder.is_symlink():
+        raise JournalError(f"{folder} is a link: move or delete what it leads to by hand")
+    if inside := ", ".join(each.name for each in run_paths(folder)):
+        raise JournalError(f"{folder} holds other runs ({inside}): move them away first")
+
+
+@contextmanager
+def _reporting_folder_errors(folder: Path) -> Iterator[None]:
+    """Turn an `OSError` while moving or deleting a run's folder into a `JournalError`."""
+    try:
+        yield
+    except OSError as error:
+        raise JournalError(f"{folder} cannot be moved or deleted: {error.strerror or error}") from error
 
 
 LIST = SimpleVerb("list the runs on this disk", configure_list, list_runs)

@@ -14,16 +14,11 @@ from rich.console import Console, ConsoleOptions, Group, RenderResult
 from rich.panel import Panel
 from rich.text import Text
 
+from dreamfleet.common.addons.analysis.scored_history import least_positive, spans_decades
 from dreamfleet.common.client.run_view import LiveRunView, format_episodes
 from dreamfleet.common.client.status import FailureStatus, Population, Status
 from dreamfleet.common.printable import format_duration, format_number, plural, printable
-from dreamfleet.common.protocol.function_values import (
-    fitness_word,
-    is_minimised,
-    least_positive,
-    spans_decades,
-    value_of,
-)
+from dreamfleet.common.protocol.function_values import fitness_word, is_minimised, value_of
 from dreamfleet.common.protocol.tasks import is_unregistered
 from dreamfleet.common.runs.records import in_values
 from dreamfleet.common.security.credentials import EXPIRY_WARNING, describe_time_left

@@ -7,8 +7,9 @@ from typing import Any, Final
 from matplotlib.figure import Figure
 
 from dreamfleet.common.addons.analysis.fitness_chart import PLOT_COLOURS
+from dreamfleet.common.addons.analysis.scored_history import spans_decades
 from dreamfleet.common.printable import plural
-from dreamfleet.common.protocol.function_values import is_minimised, spans_decades
+from dreamfleet.common.protocol.function_values import is_minimised
 from dreamfleet.common.protocol.tasks import is_function_task
 from dreamfleet.coordinator.addons.runs.plot import save_figure, show_as_is
 from dreamfleet.experiments.sweep.summary import RunResult, mean_curve, with_goal, word_of

@@ -53,6 +53,7 @@ from dreamfleet.common.runs.run_folder import CONFIRMED, RunFolder
 from dreamfleet.common.runs.run_paths import CONTROLLER, resume_command
 from dreamfleet.common.runs.run_provenance import RECEIPT, RunProvenance, StartProvenance
 from dreamfleet.common.runs.seeds import CONFIRMING_OFFSET, VALIDATION, training_seeds
+from dreamfleet.common.runs.stages import BegunStage, stages_of
 from dreamfleet.common.schema.validation import to_plain
 from dreamfleet.common.worlds.shipped import WORLDS
 from dreamfleet.coordinator.addons.dashboard.compared_runs import compare_runs
@@ -119,6 +120,16 @@ def test_a_schedules_receipt_lists_every_stage(reality):
     text = printed("runs", "receipt", "reality")
     assert re.search("- stage 2: .*1.* 7 steps", text)
     assert "sigma0" not in text
+
+
+def test_a_restart_that_was_passed_over_is_told_from_a_stage_that_is_still_to_come(reality):
+    restart = StageSettings(generations=1, score=1.0, restart=True)
+    stages = StageSettings(generations=1, score=1.0), restart, restart, StageSettings(horizon=7)
+    with RunFolder(reality) as run:
+        settings = replace(run.settings, stages=stages)
+    first, _, third, _ = stages_of(settings)
+    shown = run_details.describe_stages(settings, [BegunStage(first, 0), BegunStage(third, 1)])
+    assert [text == "left out" for text in shown.values()] == [False, True, False, False]
 
 
 def test_failed_candidates_are_counted(reality):
