@@ -1,5 +1,6 @@
 """A copy of a run that is being served, from which it goes on to the same bits when its own folder is lost."""
 
+import os
 import shlex
 import shutil
 from contextlib import closing
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from dreamfleet.common.addons.evaluation_report import REPORT
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import BUNDLE, JOURNAL, ROLLOUTS, run_command
 from dreamfleet.coordinator.addons.runs import backup
@@ -81,6 +83,23 @@ def test_the_command_that_continues_the_copy_holds_in_any_folder(finished, tmp_p
     assert code == 0, err
     words = shlex.split(out)
     assert words[words.index("--runs-dir") + 1] == str(tmp_path / "safe")
+
+
+def test_an_evaluation_goes_along_and_back_and_one_that_only_the_copy_has_stays(finished, safe):
+    source, copy = (folder / "test" / REPORT for folder in (finished.runs, safe))
+    assert not copy.exists()
+    copy.write_text("of the copy")
+    assert back_up(finished, safe)[0] == 0
+    assert copy.read_text() == "of the copy"
+    source.write_text("of the run")
+    assert back_up(finished, safe)[0] == 0
+    assert copy.read_text() == "of the run"
+    shutil.rmtree(source.parent)
+    assert call_here("runs", "backup", "test", "--runs-dir", safe, "--to", finished.runs)[0] == 0
+    assert source.read_text() == "of the run"
+    source.unlink()
+    os.mkfifo(source)  # what is no file hinders no copy
+    assert back_up(finished, safe)[0] == 0
 
 
 def test_what_cannot_be_a_copy_is_left_alone(finished, tmp_path):

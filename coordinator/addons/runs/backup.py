@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 
+from dreamfleet.common.addons.evaluation_report import REPORT
 from dreamfleet.common.errors import ControllerError, JournalError, UsageError
 from dreamfleet.common.files.atomic_write import fsync_path
 from dreamfleet.common.files.locks import open_lock, try_lock
@@ -49,7 +50,7 @@ def back_up(source: RunFolder, target: Path) -> None:
         _clear(target, aside, former)  # an earlier call may have been killed
         try:
             aside.mkdir(mode=0o700)
-            _copy_run(source, aside)
+            _copy_run(source, target, aside)
             # Nobody goes on from the earlier copy while it is compared and replaced.
             with run_lock(target) if target.exists() else nullcontext():
                 if target.exists():
@@ -141,10 +142,11 @@ def _other_ways(target: Path) -> str:
     return f"name another folder with --to, or remove it: `{run_command(target, 'runs', 'delete')}`"
 
 
-def _copy_run(source: RunFolder, folder: Path) -> None:
+def _copy_run(source: RunFolder, earlier: Path, folder: Path) -> None:
     """Copy all that the run is made of.
 
-    What the journal names lies in the folder before the journal does, so that it is copied behind it.
+    What the journal names lies in the folder before the journal does, so that it is copied behind it. An evaluation
+    that only the `earlier` copy has is kept.
     """
     _copy_controller_and_journal(source, folder)
     if source.spec.bundle:
@@ -158,6 +160,8 @@ def _copy_run(source: RunFolder, folder: Path) -> None:
         (folder / ROLLOUTS).mkdir()
     for drive in drives:
         shutil.copy2(source.path / ROLLOUTS / drive.name, folder / ROLLOUTS / drive.name)
+    if report := next((path for path in (source.path / REPORT, earlier / REPORT) if path.is_file()), None):
+        shutil.copy2(report, folder / REPORT)
     for path in (*folder.rglob("*"), folder):
         fsync_path(path)
 
