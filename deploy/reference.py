@@ -285,7 +285,8 @@ def _flag(action: argparse.Action) -> str:
     value = ""
     if action.nargs != 0 and not isinstance(action, argparse.BooleanOptionalAction):
         shown = action.metavar or ("" if action.choices else action.dest.upper())
-        value = " " + (" ".join(shown) if isinstance(shown, tuple) else shown) if shown else ""
+        shown = " ".join(shown) if isinstance(shown, tuple) else shown
+        value = f" [{shown}]" if action.nargs == "?" else f" {shown}" if shown else ""
     more = " ..." if action.nargs in ("+", "*") else ""
     chosen = " " + ", ".join(f"`{each}`" for each in action.choices) if action.choices else ""
     return ", ".join(f"`{each}{value}`" for each in names) + more + chosen

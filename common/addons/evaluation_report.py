@@ -4,7 +4,7 @@ Pages: own-environment.md, own-world-model.md.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sized
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from math import isclose
@@ -21,13 +21,14 @@ from dreamfleet.common.printable import format_number, one_line, plural, truncat
 from dreamfleet.common.protocol.function_values import minimises
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS
 from dreamfleet.common.runs.episode_results import EpisodeResult, EpisodeResults, FailedEpisode
+from dreamfleet.common.runs.paired_difference import is_clearly_below
 from dreamfleet.common.runs.standard_error import format_with_error, score_digits, standard_error
 from dreamfleet.common.schema.validation import OPTIONAL, MalformedError, Seconds, from_plain_lenient
 
 REPORT = "evaluation.json"  # its name in a run's folder and in a card's
 GYMNASIUM = "gymnasium"  # the judge of worlds that gymnasium itself has
 FACTS = "controller", "task", "options", "world", "judge", "bundle", "threshold", "marks"  # what was driven
-MAX_MARKS = 8
+MAX_MARKS, MAX_FIGURES = 8, 64
 MIN_EPISODES_TO_SOLVE = 100  # customary number of episodes for gymnasium's threshold of solving an environment
 MAX_BYTES, MAX_EPISODES, MAX_SEED = 64 << 20, 10**5, 2**63
 Sight = Literal["hidden", "foreign"]
@@ -68,6 +69,8 @@ class EvaluationReport:
     #: the same, with what decides another episode in its place
     foreign: BlindDrives = field(default=(), metadata=OPTIONAL)
     foreign_failed: Failures = field(default=(), metadata=OPTIONAL)
+    #: how much less its mean was to be in each blind pass, at least; `None`: nothing was asked
+    asked_loss: Annotated[float, Meta(ge=0, le=LARGEST_FITNESS)] | None = field(default=None, metadata=OPTIONAL)
 
     @cached_property
     def results(self) -> EpisodeResults:
@@ -79,6 +82,7 @@ class EvaluationReport:
         """What was driven blind, by the name of its field, each as a report of its own; perhaps without any score."""
         driven = {sight: (getattr(self, sight), getattr(self, sight + FAILED)) for sight in SIGHTS}
         no_sight: dict[str, Any] = {name: () for sight in SIGHTS for name in (sight, sight + FAILED)}
+        no_sight["asked_loss"] = None
         return {
             sight: replace(self, name=f"{self.name}, {SIGHTS[sight]}", drives=drives, failed=failed, **no_sight)
             for sight, (drives, failed) in driven.items()
@@ -105,6 +109,7 @@ class EvaluationReport:
             **{f"{ABOVE}{mark:g}": results.above(mark) for mark in self.marks},
             "scores": results.scores, "seeds": results.seeds, "figures": self.world_figures,
             **{f"{sight}_{key}": value for sight in SIGHTS for key, value in self._blind_figures(sight).items()},
+            "asked_loss": self.asked_loss, "sees": None if self.asked_loss is None else self.sees,
         }  # fmt: skip
 
     @property
@@ -114,18 +119,38 @@ class EvaluationReport:
         names = sorted({name for each in found for name in each})
         return {name: fmean(each[name] for each in found if name in each) for name in names}
 
-    def _blind_figures(self, sight: Sight) -> dict[str, float | None]:
-        """The mean of what was driven blind, and how much less it is than with sight, seed by seed.
+    @property
+    def sees(self) -> bool:
+        """Whether the loss in each blind pass is as much as was asked, and significant."""
+        return not self._passes_without_loss()
 
-        They are over the `n` seeds with a score in each pass that has any, so that all passes have the same episodes.
+    def _passes_without_loss(self) -> list[str]:
+        """The blind passes that do not show the loss that was asked for, in words; also those without a score."""
+        missing, asked = [], self.asked_loss or 0.0
+        for sight, text in SIGHTS.items():
+            plain, blind = self._paired_scores(sight)
+            if not is_clearly_below(blind, plain) or fmean(plain.values()) - fmean(blind.values()) < asked:
+                missing.append(text)
+        return missing
+
+    def _paired_scores(self, sight: Sight) -> tuple[dict[int, float], dict[int, float]]:
+        """The scores with sight and those of this pass, by seed.
+
+        They are over the seeds with a score in each pass that has any, so that all passes have the same episodes.
         """
         passes = [{each.seed for each in found.drives} for found in self.blind_passes.values() if found.drives]
         plain = {each.seed: each.score for each in self.drives}
-        scores = {each.seed: each.score for each in getattr(self, sight)}
-        if not (seeds := [seed for seed in plain if scores and all(seed in each for each in passes)]):
+        blind = {each.seed: each.score for each in getattr(self, sight)}
+        seeds = [seed for seed in plain if blind and all(seed in each for each in passes)]
+        return {seed: plain[seed] for seed in seeds}, {seed: blind[seed] for seed in seeds}
+
+    def _blind_figures(self, sight: Sight) -> dict[str, float | None]:
+        """The mean over the `n` seeds of what was driven blind, and how much less it is than with sight, by seed."""
+        plain, blind = self._paired_scores(sight)
+        if not plain:
             return dict.fromkeys(BLIND_FIGURES)
-        means, less = [scores[seed] for seed in seeds], [plain[seed] - scores[seed] for seed in seeds]
-        values = len(seeds), fmean(means), standard_error(means), fmean(less), standard_error(less)
+        means, less = [*blind.values()], [plain[seed] - score for seed, score in blind.items()]
+        values = len(plain), fmean(means), standard_error(means), fmean(less), standard_error(less)
         return dict(zip(BLIND_FIGURES, values, strict=True))
 
     def describe_scores(self, word: str = "seed") -> list[str]:
@@ -137,7 +162,14 @@ class EvaluationReport:
                 score, loss = (format_with_error(found[key] or 0.0, found[f"{key}_error"]) for key in ("mean", "loss"))
                 parts.insert(0, f"{score} on {plural(int(found['n']), word)}, {loss} less, {word} by {word}")
             lines.append(f"{text}: {'; '.join(filter(None, parts)) or 'no score'}")
-        return lines
+        return [*lines, *([] if self.asked_loss is None else [self.describe_sight()])]
+
+    def describe_sight(self) -> str:
+        """Whether it loses as much without sight as was asked, in words."""
+        loss = f"significant loss of at least {format_number(self.asked_loss or 0.0)}"
+        if missing := self._passes_without_loss():
+            return f"not shown to see: no {loss} {' and '.join(missing)}"
+        return f"it sees: a {loss} {' and '.join(SIGHTS.values())}"
 
     def describe(self, word: str = "seed") -> str:
         """A text for display: the score, figures on driving, the threshold and the controller; `word`: one seed."""
@@ -214,23 +246,25 @@ def read_evaluation_report(path: Path) -> EvaluationReport:
         return found
     except FileNotFoundError:
         raise UsageError(f"no report at {path}: `{shell_command('evaluate', '--out', path)}` writes one") from None
-    except (OSError, ValueError, TypeError, MalformedError, RecursionError, OverflowError) as error:
+    except (OSError, ValueError, TypeError, MalformedError, RecursionError, OverflowError, UsageError) as error:
         raise UsageError(f"{path} is not a report of `dreamfleet evaluate --out` ({error}): write it again") from error
 
 
 def _check_episodes(report: EvaluationReport) -> set[int]:
-    """The seeds of a report's episodes; `ValueError` for one that occurs twice, or a score out of range."""
+    """The seeds of a report's episodes; `ValueError` for one twice, a score out of range, or too many names."""
     seeds = [*(each.seed for each in report.drives), *(each.seed for each in report.failed)]
     if len(set(seeds)) < len(seeds):
         raise ValueError("a seed occurs twice")
     if not all(abs(each.score) <= LARGEST_FITNESS for each in report.drives):  # false for NaN too
         raise ValueError(f"a score is beyond ±{LARGEST_FITNESS:g}")
+    check_names({name for each in report.drives for name in each.figures or ()})
     return set(seeds)
 
 
 def _check_figures(report: EvaluationReport, plain: Mapping[str, object]) -> None:
     """`ValueError` for a statistic that the drives contradict; a report need not state each."""
     marks = {name: float(name.removeprefix(ABOVE)) for name in plain if name.startswith(ABOVE)}
+    check_names(marks=marks)
     figures = {name: report.results.above(mark) for name, mark in marks.items()} | report.figures
     for name, value in figures.items():
         stated = plain.get(name)
@@ -247,6 +281,13 @@ def _is_equal(stated: object, value: object) -> bool:
             return False
         return all(_is_equal(each, value[name]) for name, each in stated.items())
     return isinstance(stated, int | float) and isinstance(value, int | float) and isclose(stated, value)
+
+
+def check_names(figures: Sized = (), marks: Sized = ()) -> None:
+    """`UsageError` for more figures or marks of a world than a report holds."""
+    for found, most, what in ((figures, MAX_FIGURES, "figures"), (marks, MAX_MARKS, "marks")):
+        if len(found) > most:
+            raise UsageError(f"its world has {len(found):,} {what}, and a report holds at most {most}")
 
 
 def check_seed_range(first_seed: int, episodes: int) -> None:

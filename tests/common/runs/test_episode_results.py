@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dreamfleet.common.addons.evaluation_report import EvaluationReport, read_evaluation_report
+from dreamfleet.common.addons.evaluation_report import MAX_FIGURES, MAX_MARKS, EvaluationReport, read_evaluation_report
 from dreamfleet.common.artifacts.bundle_store import find_bundle, pretrained_folder
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.subspace import Subspace
@@ -169,7 +169,22 @@ def test_a_blind_pass_is_over_the_seeds_of_all_passes_and_its_failures_stay(tmp_
     assert read_evaluation_report(tmp_path / "report.json").figures["hidden_n"] is None
 
 
+def test_what_was_asked_of_a_blind_pass_needs_a_clear_loss_in_each():
+    plain = scored(500, 510, 520)
+    passes = {(100, 100, 100): True, (99, 100, 101): True, (99, 100, 99): False, (0, 0, 800): False}
+    for losses, sees in passes.items():
+        blind = tuple(replace(each, score=each.score - less) for each, less in zip(plain.drives, losses, strict=True))
+        report = replace(plain, hidden=blind, foreign=blind, asked_loss=100.0)
+        assert (report.sees, report.figures["sees"], report.figures["asked_loss"]) == (sees, sees, 100)
+        assert report.describe_sight() in report.describe()
+        for one in ({"hidden": ()}, {"foreign": plain.drives}, {"foreign": blind[:1]}):
+            assert not replace(report, **one).sees
+        assert replace(report, asked_loss=0.0).sees == (losses != (0, 0, 800))
+    assert (plain.figures["sees"], plain.figures["asked_loss"]) == (None, None)
+
+
 @pytest.mark.parametrize("changes", [
+    {"asked_loss": 1.0, "sees": True}, {"sees": False}, {"asked_loss": -1.0}, {"asked_loss": float("nan")},
     {"hidden": [replace(DRIVES[0], seed=99)]}, {"foreign": [DRIVES[0]] * 2}, {"hidden_failed": [BROKEN]},
     {"foreign": DRIVES, "foreign_failed": [FailedEpisode(10_000, "E: x")]}, {"hidden_loss": 3.0}, {"foreign_n": 0},
     *({"hidden": [replace(DRIVES[0], score=score)]} for score in (1e101, float("nan"), float("-inf"))),
@@ -180,6 +195,19 @@ def test_a_report_whose_blind_drives_or_figures_cannot_be_is_refused(tmp_path, c
     path = tmp_path / "report.json"
     path.write_text(json.dumps({**json.loads(JUDGEMENT.to_json()), **changes}, default=asdict))
     with pytest.raises(UsageError, match=re.escape(str(path))):
+        read_evaluation_report(path)
+
+
+@pytest.mark.parametrize(("most", "changes"), [
+    (MAX_FIGURES, {"drives": [replace(DRIVES[0], figures=dict.fromkeys(map(str, range(100_000)), 1.0))]}),
+    (MAX_FIGURES, {"hidden": [replace(each, figures={str(each.seed * 100 + n): 1.0 for n in range(40)})
+                              for each in DRIVES]}),
+    (MAX_MARKS, {f"above_{mark}": 0.0 for mark in range(1000, 101_000)}),
+])  # fmt: skip
+def test_a_report_with_more_names_than_a_world_has_is_refused(tmp_path, most, changes):
+    path = tmp_path / "report.json"
+    path.write_text(json.dumps({**asdict(JUDGEMENT), **changes}, default=asdict))
+    with pytest.raises(UsageError, match=f"{re.escape(str(path))}.* {most}"):
         read_evaluation_report(path)
 
 

@@ -9,7 +9,7 @@ from statistics import fmean
 from time import perf_counter
 from typing import Any
 
-from dreamfleet.common.addons.evaluation_report import FAILED, SIGHTS, EvaluationReport, Sight
+from dreamfleet.common.addons.evaluation_report import FAILED, SIGHTS, EvaluationReport, Sight, check_names
 from dreamfleet.common.cli.progress import progress_bar
 from dreamfleet.common.errors import DreamfleetError, StoppedError
 from dreamfleet.common.host.fingerprint import fingerprint
@@ -102,8 +102,9 @@ def judge(
     """Drive one whole episode per seed, with a progress bar on stderr; `note` gets a line for each that fails.
 
     `name` is the agent's in the report, and `how` says how it drives if not as ever. `StoppedError` for a Ctrl-C once
-    an episode has a score: it says the mean of those that have.
+    an episode has a score: it says the mean of those that have. `UsageError` for a world that no report can describe.
     """
+    check_names(agent.world.figures, agent.world.marks)
     began = perf_counter()
     results = EpisodeResults.of(_drive_all(agent, seeds, jobs, note, how))
     return EvaluationReport(

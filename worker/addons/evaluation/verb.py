@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +19,7 @@ from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, open_output
 from dreamfleet.common.host.resource_limits import usable_cores
+from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS
 from dreamfleet.common.runs.lookup import find_bundle_of
 from dreamfleet.common.runs.seeds import TEST
 from dreamfleet.worker.addons.evaluation.named_agents import find_driver, is_random
@@ -55,9 +57,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bundle", help="the world model (default: the one that the controller names)")
     parser.add_argument("--jobs", type=int, default=usable_cores(), help="processes (default one per core)")
     parser.add_argument(
-        "--blind", action="store_true",
-        help="drive the same episodes twice more: with what decides painted out of the pictures, and with another "
-        "episode's in its place",
+        "--blind", nargs="?", metavar="LOSS", type=float, const=True,
+        help="drive the same episodes twice more: what decides is painted out, then another episode's painted in; "
+        "LOSS: exit 1 unless the mean loses that much by each, significantly",
     )  # fmt: skip
     add_global_flags(parser, "runs_dir")
     parser.add_argument("--json", action="store_true", help="print every figure and drive as JSON")
@@ -106,6 +108,9 @@ def run(args: argparse.Namespace) -> int:
     if args.episodes < 1 or args.first_seed < 0 or args.jobs < 1:
         raise UsageError("--episodes and --jobs must be at least 1, --first-seed at least 0")
     check_seed_range(args.first_seed, args.episodes)
+    asked = None if args.blind is True else args.blind
+    if asked is not None and not 0 <= asked <= LARGEST_FITNESS:
+        raise UsageError(f"--blind {asked:g}: a loss is from 0 to {LARGEST_FITNESS:g}")
     if args.out:
         check_output_path(args.out)
     name, agent = _choose_agent(args)
@@ -114,10 +119,10 @@ def run(args: argparse.Namespace) -> int:
     if seeds[0] not in TEST or seeds[-1] not in TEST:
         some = "some" if seeds[0] < TEST.stop and seeds[-1] >= TEST.start else "none"
         note(f"note: test seeds are {TEST.start} to {TEST.stop - 1}; {some} of these are among them")
-    sights, found = (SIGHTS if args.blind else {}), None
+    sights, found = ({} if args.blind is None else SIGHTS), None
     try:
         for each in judge_in_passes(name, agent, seeds, args.jobs, note, sights):
-            found = each
+            found = replace(each, asked_loss=asked)
     finally:  # a blind pass that is interrupted or fails takes nothing from those before
         if found is not None:
             if missing := [how for sight, how in sights.items() if sight not in found.blind_passes]:
@@ -128,7 +133,7 @@ def run(args: argparse.Namespace) -> int:
                     file.write(f"{found.to_json()}\n".encode())
     if args.controller and args.cell is None:  # a live run's controller, and a cell's, are no file here
         print_next(args, ("record", *agent_flags(args)))
-    return 0
+    return 0 if asked is None or (found is not None and found.sees) else 1
 
 
 def _choose_agent(args: argparse.Namespace) -> tuple[str, Agent]:

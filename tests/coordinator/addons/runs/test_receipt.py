@@ -248,6 +248,11 @@ def test_an_evaluation_in_the_folder_of_the_reported_controller_is_shown_with_it
     assert (found["mean"], found["hidden_mean"], found["foreign_loss"]) == (20, 10, 10)
     assert found["hidden_loss_error"] == pytest.approx(5 / np.sqrt(3))
     assert {20.0, 10.0, 2.9} <= set(numbers(shown()["evaluated"]))
+    for asked, sees in ((9.0, False), (None, None)):  # 10 less, with an error of 2.9, and of 3 seeds
+        path.write_text(replace(own, asked_loss=asked).to_json())
+        found = json.loads(printed("runs", "show", "reality", "--json"))["evaluated"]
+        assert (found["asked_loss"], found["sees"]) == (asked, sees)
+        assert (9.0 in numbers(shown()["evaluated"])) == (asked is not None)
     for other in (replace(own, controller="ab" * 32).to_json(), "{"):
         path.write_text(other)
         assert "evaluated" not in shown()

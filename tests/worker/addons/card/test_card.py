@@ -201,11 +201,12 @@ def test_a_card_has_the_blind_scores_beside_the_plain_one():
         read_evaluation_report(REPORT),
     )
     blind = {sight: tuple(replace(each, score=score) for each in plain.drives) for sight, score in SCORES.items()}
-    report = replace(plain, **blind)
+    report = replace(plain, **blind, asked_loss=100.0)
     text = "\n".join(describe_card(CardContents(controller, None, report, "toy"), []))
     loss = format_with_error(report.figures["hidden_loss"], report.figures["hidden_loss_error"])
     assert all(f"{score:.1f}" in text for score in (plain.results.mean, *SCORES.values()))
     assert loss in text
+    assert report.describe_sight() in text
 
 
 def test_what_draws_no_pictures_has_a_card_without_a_video_that_says_why(tmp_path, capsys):

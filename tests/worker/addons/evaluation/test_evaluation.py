@@ -10,13 +10,20 @@ import subprocess
 import sys
 from copy import deepcopy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import dreamfleet
 from dreamfleet import make_environment, make_policy
-from dreamfleet.common.addons.evaluation_report import SIGHTS, EvaluationReport, read_evaluation_report
+from dreamfleet.common.addons.evaluation_report import (
+    MAX_FIGURES,
+    MAX_MARKS,
+    SIGHTS,
+    EvaluationReport,
+    read_evaluation_report,
+)
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.controller import Controller, ControllerShape
@@ -32,6 +39,7 @@ from dreamfleet.worker.addons.evaluation.evaluation import (
     DriveStatistics,
     evaluate,
     evaluate_in_processes,
+    judge,
 )
 from dreamfleet.worker.scoring import episode
 from dreamfleet.worker.scoring.episode import EpisodeConfig, Transition
@@ -220,6 +228,30 @@ def test_blind_episodes_stand_beside_those_with_sight(words, tmp_path):
     assert (code, "--blind" in err) == (2, True)
 
 
+@pytest.mark.parametrize(("asked", "sees"), [(9, True), (15, False)])
+def test_a_loss_that_is_asked_of_blind_episodes_decides_the_exit_code(words, tmp_path, asked, sees):
+    """Hidden costs 10, another's sight 20."""
+    out = tmp_path / "report.json"
+    code, said, err = call_here(*words(tasks.MASKED, "--episodes", 2, "--jobs", 1, "--out", out, "--blind", asked))
+    report, plain = read_evaluation_report(out), json.loads(out.read_text())
+    assert (code, report.sees, plain["sees"]) == (0 if sees else 1, sees, sees), err
+    assert (report.asked_loss, plain["asked_loss"]) == (asked, asked)
+    assert report.describe_sight() in said
+
+
+@pytest.mark.parametrize("asked", ["-1", "nan", "1e101"])
+def test_a_loss_that_cannot_be_asked_for_is_refused_before_the_episodes(words, asked):
+    code, _, err = call_here(*words(tasks.HANGING, "--blind", asked))
+    assert (code, "--blind" in err) == (2, True)
+
+
+def test_a_world_with_more_figures_or_marks_than_a_report_holds_is_refused_before_the_episodes():
+    for most, name in ((MAX_FIGURES, "figures"), (MAX_MARKS, "marks")):
+        agent = SimpleNamespace(world=World(STEERING_GAS_BRAKE, **{name: tuple(range(most + 1))}))
+        with pytest.raises(UsageError, match=str(most)):
+            judge("a", agent, SEEDS, 1)
+
+
 def test_blind_episodes_that_fail_are_kept_and_all_passes_have_the_same_seeds(words, random_bundle, tmp_path):
     out = tmp_path / "report.json"
     code, said, err = call_here(*words(tasks.VEILED, "--episodes", 4, "--jobs", 1, "--blind", "--out", out))
@@ -272,13 +304,20 @@ def test_blind_drives_are_driven_again_and_a_forged_one_is_found(words, random_b
     def verified(report):
         out.write_text(report.to_json())
         code, said, _ = call_here("verify", "report", out, "--bundle", random_bundle.path, "--jobs", 1, "--json")
-        return code, said and [each["differing"] for each in json.loads(said)["reports"][0]["blind"]]
+        row = json.loads(said)["reports"][0] if said else {"blind": [], "sees": None}
+        return code, [each["differing"] for each in row["blind"]], row["sees"]
 
-    assert verified(recorded) == (0, [[], []])
+    assert verified(replace(recorded, asked_loss=15.0)) == (0, [[], []], False), "as it was recorded"
     first, *others = recorded.foreign
     forged = replace(recorded, foreign=(replace(first, score=first.score - 1), *others))
-    assert verified(forged) == (1, [[], [first.seed]])
-    assert verified(replace(recorded, hidden=(), foreign=())) == (0, [])
+    assert verified(forged) == (1, [[], [first.seed]], None)
+    lower = zip(recorded.hidden, (0.1, 0.12, -0.02), strict=True)  # within two standard errors of the true ones
+    forged = replace(recorded, hidden=tuple(replace(each, score=each.score - less) for each, less in lower))
+    forged = replace(forged, fingerprint="elsewhere", asked_loss=10.05)
+    assert forged.sees
+    assert verified(forged) == (1, [[*forged.results.seeds], []], False)
+    assert verified(replace(forged, asked_loss=9.0)) == (0, [[*forged.results.seeds], []], True)
+    assert verified(replace(recorded, hidden=(), foreign=())) == (0, [], None)
     controller_of(random_bundle, tasks.TOY).save(tmp_path / "toy.npz")
     code, _, _ = call_here(*words(tasks.TOY, "--episodes", 3, "--jobs", 1, "--out", out))
     assert (code, verified(replace(read_evaluation_report(out), hidden=recorded.hidden))[0]) == (0, 2)
