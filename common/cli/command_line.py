@@ -163,15 +163,6 @@ def build_parser(name: str, verb: Configurable) -> Parser:
     return parser
 
 
-def parse_flags(name: str, verb: Configurable, words: Sequence[object]) -> argparse.Namespace:
-    """What a verb's arguments are under these words, the file and the environment; `UsageError` for wrong ones."""
-    from dreamfleet.common.cli.global_config import read_arguments
-
-    args = build_parser(name, verb).parse_all(list(map(str, words)))
-    read_arguments(args)
-    return args
-
-
 def load_verb(point: EntryPoint) -> Verb:
     """The verb of an entry point; `DreamfleetError` names its owner if it cannot be imported."""
     try:

@@ -142,14 +142,6 @@ def load_credentials(args: argparse.Namespace, roles: Collection[str] = ()) -> C
     return credentials
 
 
-def security_flags(args: argparse.Namespace) -> tuple[str, ...]:
-    """The flags by which another coordinator has the same join file and list of revoked files; none without one."""
-    join, access_dir = args.global_config.join, args.global_config.access_dir
-    if join is None:
-        return ()
-    return ("--join", str(join), *(("--access-dir", str(access_dir)) if access_dir != GlobalConfig.access_dir else ()))
-
-
 def resolve_network(args: argparse.Namespace, *roles: str) -> Network:
     """The fleet's address and this program's credentials; the join file's address if none is configured."""
     credentials = load_credentials(args, roles)

@@ -128,19 +128,6 @@ def join_places(*folders: str) -> str:
     return os.pathsep.join(dict.fromkeys(filter(None, (*folders, *known))))
 
 
-def check_module_name(module: str) -> None:
-    """`UsageError` for a user's module that is called like one of Python's own, which other processes import instead.
-
-    In `PYTHONPATH` it would replace Python's own one in each process, and end most of them.
-    """
-    top, folder = module.partition(".")[0], module_folder(module)
-    if top in sys.stdlib_module_names and folder and not folder.is_relative_to(Path(os.__file__).resolve().parent):
-        raise UsageError(
-            f"the module {top!r} in {folder} is called like one of Python's own, which other processes would import "
-            "instead: give it another name"
-        )
-
-
 def _is_pythons(module: str) -> bool:
     return module.partition(".")[0] in sys.stdlib_module_names
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.bundle_store import (
-    INT8_SUFFIX,
     BundleStore,
     default_cache,
     find_bundle,
@@ -149,12 +148,6 @@ def find_bundle_of(
             raise BundleError(f"the controller's world model {controller.bundle[:12]}... is not here: {remedy}")
         bundle = found
     return bundle.for_controller(controller)
-
-
-def shipped_subspace_name(bundle: str) -> str | None:
-    """The name of the shipped subspace for a shipped world model, of eight bits too; `None` if there is none."""
-    name = bundle.removesuffix(INT8_SUFFIX)
-    return name if is_file(pretrained_folder() / SUBSPACES / f"{name}.npz") else None
 
 
 def find_subspace(name: str) -> Subspace:

@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from dreamfleet.common.artifacts.bundle_store import INT8_SUFFIX, pretrained_folder
 from dreamfleet.common.artifacts.driving import FIRST_WORLD
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.cli.output import print_rows
@@ -28,14 +29,14 @@ from dreamfleet.common.cli.progress import LOG_INTERVAL, progress_bar
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.client.run_view import LiveRunView
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, UsageError
-from dreamfleet.common.files.regular_files import path_exists
+from dreamfleet.common.files.regular_files import is_file, path_exists
 from dreamfleet.common.host.processes import VerbProcess, shell_command
 from dreamfleet.common.host.reports import ADDRESS
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import never_stop
 from dreamfleet.common.printable import plural
 from dreamfleet.common.protocol.keys import check_run_name
-from dreamfleet.common.runs.lookup import shipped_subspace_name
+from dreamfleet.common.runs.lookup import SUBSPACES
 from dreamfleet.common.runs.run_folder import open_run
 from dreamfleet.common.runs.run_paths import CONTROLLER, JOURNAL, resume_command, run_command
 from dreamfleet.common.runs.seeds import TEST
@@ -289,6 +290,12 @@ class Demo:
         self._console.print(text, style="bold", markup=False, highlight=False, soft_wrap=True)
 
 
+def _shipped_subspace_name(bundle: str) -> str | None:
+    """The name of the shipped subspace for a shipped world model, of eight bits too; `None` if there is none."""
+    name = bundle.removesuffix(INT8_SUFFIX)
+    return name if is_file(pretrained_folder() / SUBSPACES / f"{name}.npz") else None
+
+
 def _evaluation_flags(every: int, tracks: int, confirming: int) -> dict[str, object]:
     return {"evaluate-every": every, "evaluation-episodes": tracks, "confirm-episodes": confirming}
 
@@ -296,7 +303,7 @@ def _evaluation_flags(every: int, tracks: int, confirming: int) -> dict[str, obj
 def plan_runs(config: DemoConfig, name: str, runs_dir: Path) -> tuple[DemoRun, ...]:
     """The demonstration's runs, in order."""
     found, plan = [], config.plan
-    subspace = (shipped_subspace_name(plan.bundle) or NO_SUBSPACE) if config.subspace is None else config.subspace
+    subspace = (_shipped_subspace_name(plan.bundle) or NO_SUBSPACE) if config.subspace is None else config.subspace
     few = subspace != NO_SUBSPACE
     search: dict[str, object] = {"subspace": subspace, "covariance": "full"} if few else {}
     sigma0 = (SUBSPACE_SIGMA0 if few else FULL_SIGMA0) if config.sigma0 is None else config.sigma0

@@ -1,11 +1,13 @@
 """A world model from nothing: its stages, in order, in one data folder; and stages by the flags of their verbs."""
 
-from collections.abc import Callable
+import argparse
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from dreamfleet.common.cli.command_line import parse_flags
+from dreamfleet.common.cli.command_line import Configurable, build_parser
+from dreamfleet.common.cli.global_config import read_arguments
 from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.common.host.processes import shell_command
 from dreamfleet.common.host.stop_signals import Stop, never_stop
@@ -20,6 +22,13 @@ from dreamfleet.worker.verbs import train
 
 COLLECT, VAE, ENCODE, MDNRNN, BUNDLE = STAGES = ("collect", "train.vae", "encode", "train.mdnrnn", "bundle")
 MORE = 4  # times as many updates as the VAE had are advised where it learnt too little
+
+
+def parse_flags(name: str, verb: Configurable, words: Sequence[object]) -> argparse.Namespace:
+    """What a verb's arguments are under these words, the file and the environment; `UsageError` for wrong ones."""
+    args = build_parser(name, verb).parse_all(list(map(str, words)))
+    read_arguments(args)
+    return args
 
 
 def read_training(model: Model, data: Path, seed: int, *words: object) -> TrainRequest:

@@ -17,7 +17,7 @@ from typing import Any
 
 from dreamfleet.common.artifacts.objective import takes_seed
 from dreamfleet.common.errors import UsageError
-from dreamfleet.common.host.trusted_modules import PLACES, check_module_name, join_places, module_folder
+from dreamfleet.common.host.trusted_modules import PLACES, join_places, module_folder
 from dreamfleet.common.protocol.tasks import FUNCTION, module_of
 
 REMEDY = "write it as `def`, a partial function or an object at the top level of a module, and pass that"
@@ -45,8 +45,21 @@ def environment_for(names: Iterable[object]) -> dict[str, str]:
     """
     modules = [module_of(name) for name in names if isinstance(name, str)]
     for module in filter(None, modules):
-        check_module_name(module)
+        _check_module_name(module)
     return _path_with(*(module_folder(module) for module in modules if module))
+
+
+def _check_module_name(module: str) -> None:
+    """`UsageError` for a user's module that is called like one of Python's own, which other processes import instead.
+
+    In `PYTHONPATH` it would replace Python's own one in each process, and end most of them.
+    """
+    top, folder = module.partition(".")[0], module_folder(module)
+    if top in sys.stdlib_module_names and folder and not folder.is_relative_to(Path(os.__file__).resolve().parent):
+        raise UsageError(
+            f"the module {top!r} in {folder} is called like one of Python's own, which other processes would import "
+            "instead: give it another name"
+        )
 
 
 def _path_with(*folders: Path | None) -> dict[str, str]:
@@ -70,7 +83,7 @@ def name_function(function: Callable[..., Any] | str) -> FunctionName:
         found = FunctionName(f"{FUNCTION}:{own}", module_folder(function.partition(":")[0]))
     else:
         found = _name_object(function)
-    check_module_name(found.task.split(":")[1])
+    _check_module_name(found.task.split(":")[1])
     if os.environ.get(IMPORTED_FOR) == found.task:
         raise UsageError(
             "a process of the fleet imports this module to call its function, and the module then searches again: put "

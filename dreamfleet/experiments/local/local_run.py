@@ -16,6 +16,7 @@ from random import SystemRandom
 from typing import Any
 
 from dreamfleet.common.cli.command_line import build_parser
+from dreamfleet.common.cli.global_config import GlobalConfig
 from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import ConnectionFailedError, DreamfleetError, StoppedError, UsageError
 from dreamfleet.common.files.regular_files import path_exists
@@ -192,6 +193,14 @@ def task_flags(*tasks: str) -> tuple[str, ...]:
     ('--task', 'gym:mine:Own-v0')
     """
     return tuple(word for task in dict.fromkeys(tasks) if ":" in task for word in ("--task", task))
+
+
+def security_flags(args: argparse.Namespace) -> tuple[str, ...]:
+    """The flags by which another coordinator has the same join file and list of revoked files; none without one."""
+    join, access_dir = args.global_config.join, args.global_config.access_dir
+    if join is None:
+        return ()
+    return ("--join", str(join), *(("--access-dir", str(access_dir)) if access_dir != GlobalConfig.access_dir else ()))
 
 
 def has_begun(runs_dir: Path, name: str) -> bool:

@@ -14,7 +14,7 @@ from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.artifacts.world_facts import WorldFacts
 from dreamfleet.common.cli.command_line import Configurable, build_parser
 from dreamfleet.common.cli.config import add_flags, configured_values, load
-from dreamfleet.common.cli.global_config import add_global_flags, load_credentials, security_flags
+from dreamfleet.common.cli.global_config import add_global_flags, load_credentials
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next, print_rows
 from dreamfleet.common.cli.presets import default_run_preset
 from dreamfleet.common.cli.world_flags import OPTIONS
@@ -39,7 +39,7 @@ from dreamfleet.experiments.iteration.plan import INIT, Phase
 from dreamfleet.experiments.iteration.runner import Iteration
 from dreamfleet.experiments.iteration.summary import format_entry
 from dreamfleet.experiments.local.kept_words import accept, check_kept, chosen_code
-from dreamfleet.experiments.local.local_run import LocalFleet, parse_run_flags, task_flags
+from dreamfleet.experiments.local.local_run import LocalFleet, parse_run_flags, security_flags, task_flags
 from dreamfleet.worker.addons.bundles import verb as bundle_verb
 from dreamfleet.worker.training.stages.train import MODELS
 from dreamfleet.worker.verbs import train

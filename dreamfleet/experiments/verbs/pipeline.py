@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dreamfleet.common.cli.command_line import parse_flags
 from dreamfleet.common.cli.key_values import split_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_next
 from dreamfleet.common.cli.presets import preset_help_text
@@ -16,7 +15,7 @@ from dreamfleet.common.files.atomic_write import check_output_path
 from dreamfleet.common.host.packages import check_modules
 from dreamfleet.common.host.resource_limits import usable_cores
 from dreamfleet.common.host.stop_signals import stop_on_signals
-from dreamfleet.experiments.pipeline import PipelineRequest, make_world_model, read_bundle, read_training
+from dreamfleet.experiments.pipeline import PipelineRequest, make_world_model, parse_flags, read_bundle, read_training
 from dreamfleet.worker.addons.bundles.verb import use_bundle
 from dreamfleet.worker.training.stages import StageReport
 from dreamfleet.worker.training.stages.train import Model, TrainRequest

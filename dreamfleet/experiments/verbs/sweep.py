@@ -10,7 +10,7 @@ from typing import Any
 from dreamfleet.common.artifacts.bundle_store import find_bundle
 from dreamfleet.common.cli.command_line import build_parser
 from dreamfleet.common.cli.config import add_flags, load, read_table, read_toml
-from dreamfleet.common.cli.global_config import add_global_flags, load_credentials, security_flags
+from dreamfleet.common.cli.global_config import add_global_flags, load_credentials
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
 from dreamfleet.common.errors import StoppedError, UsageError
 from dreamfleet.common.files.locks import folder_lock
@@ -27,7 +27,7 @@ from dreamfleet.coordinator.settings.freezing import freeze
 from dreamfleet.coordinator.settings.limits import LimitsConfig
 from dreamfleet.coordinator.settings.network import NetworkConfig
 from dreamfleet.experiments.local.kept_words import accept, check_announced, check_kept, chosen_code
-from dreamfleet.experiments.local.local_run import free_port, load_parsed_flags
+from dreamfleet.experiments.local.local_run import free_port, load_parsed_flags, security_flags
 from dreamfleet.experiments.started_run import check_settings, flag_words
 from dreamfleet.experiments.sweep import summary
 from dreamfleet.experiments.sweep.display import showing

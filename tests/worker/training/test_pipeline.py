@@ -18,10 +18,10 @@ from dreamfleet.common.artifacts.bundle import RECORDED_STATES, REQUIRED, WEIGHT
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.artifacts.world_facts import EndRule, RewardFacts
 from dreamfleet.common.cli import command_line
-from dreamfleet.common.cli.command_line import main, parse_flags
+from dreamfleet.common.cli.command_line import main
 from dreamfleet.common.errors import ControllerError, DatasetError, DreamfleetError, StoppedError, UsageError
 from dreamfleet.experiments import pipeline as stages
-from dreamfleet.experiments.pipeline import STAGES, check_vae
+from dreamfleet.experiments.pipeline import STAGES, check_vae, parse_flags
 from dreamfleet.experiments.verbs import pipeline
 from dreamfleet.worker.addons.refit.fit_subspace import find_subspace, make_targets
 from dreamfleet.worker.addons.refit.refit import output_bounds, output_names, refit
