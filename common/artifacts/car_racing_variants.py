@@ -68,9 +68,12 @@ class Variant(Driving):
         }
 
     @classmethod
+    @lru_cache
     def from_json(cls, options: str) -> Variant:
         """Parse a specification's options, a JSON object or an empty text; `UsageError` lists the known options."""
-        return _parse_options(options)
+        found = cls(**read_options(CAR_RACING, options, cls.HELP))
+        shift, time, offroad = map(float, (found.pedal_shift, found.time_cost, found.offroad_cost))
+        return replace(found, pedal_shift=shift, time_cost=time, offroad_cost=offroad)
 
     @property
     def version(self) -> int:
@@ -98,13 +101,6 @@ class Variant(Driving):
             return STEERING_AND_HALVES
         shift = (0.0, self.pedal_shift, -self.pedal_shift)
         return Continuous((1, 1, -1), shift, low=(-1, 0, 0), high=(1, 1, 1), output_indices=(0, 1, 1))
-
-
-@lru_cache
-def _parse_options(options: str) -> Variant:
-    found = Variant(**read_options(CAR_RACING, options, Variant.HELP))
-    shift, time, offroad = map(float, (found.pedal_shift, found.time_cost, found.offroad_cost))
-    return replace(found, pedal_shift=shift, time_cost=time, offroad_cost=offroad)
 
 
 def _within(value: Any, low: float, high: float) -> bool:

@@ -123,8 +123,7 @@ def read_settings(
 
 def read_table(section: type[Any], where: str, table: Table) -> dict[str, Any]:
     """The values of a TOML table, converted to its fields' types; `UsageError` names `where` a value is wrong."""
-    known = _field_types(section)
-    return _from_table(known, where, table)
+    return _from_table(_field_types(section), where, table)
 
 
 def read_toml(
@@ -185,7 +184,7 @@ def _from_environment(known: Mapping[str, Any], section: str, environment: Mappi
 
 def _convert_toml_value(hint: Any, value: Any, where: str) -> Any:
     """Convert a TOML value to the field's type."""
-    base = _without_none(hint)
+    base = without_none(hint)
     if get_origin(base) is tuple and isinstance(value, list):
         with suppress(UsageError):  # the error below is of the whole list
             return tuple(_convert_toml_value(get_args(base)[0], item, where) for item in value)
@@ -202,7 +201,7 @@ def _convert_toml_value(hint: Any, value: Any, where: str) -> Any:
 
 def _parse_text(hint: Any, text: str, where: str) -> Any:
     """Convert the text of an environment variable to the field's type."""
-    base = _without_none(hint)
+    base = without_none(hint)
     if base is Path and base is not hint and not text:
         return None  # as if unset: an empty path would be the current folder
     if get_origin(base) is tuple:
@@ -221,11 +220,11 @@ def _parse_text(hint: Any, text: str, where: str) -> Any:
 
 def _takes_empty(hint: Any) -> bool:
     """Whether an empty variable is a value: an empty text, an empty list, no path."""
-    base = _without_none(hint)
+    base = without_none(hint)
     return base is str or get_origin(base) is tuple or (base is Path and base is not hint)
 
 
-def _without_none(hint: Any) -> Any:
+def without_none(hint: Any) -> Any:
     """The type without `| None`."""
     if get_origin(hint) in (Union, types.UnionType):
         return next(option for option in get_args(hint) if option is not type(None))
@@ -251,7 +250,7 @@ def _default_text(each: Field[Any]) -> str:
 
 
 def _flag_options(each: Field[Any], hint: Any, text: str) -> dict[str, Any]:
-    base = _without_none(hint)
+    base = without_none(hint)
     options: dict[str, Any] = {"default": argparse.SUPPRESS, "dest": each.name, "help": text}
     if base is bool:
         return {**options, "action": argparse.BooleanOptionalAction}

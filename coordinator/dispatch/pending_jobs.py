@@ -110,9 +110,8 @@ class PendingJobs(Mapping[bytes, PendingJob]):
     """Every wanted job by its digest. Workers are only names here."""
 
     def __init__(self, evaluation_share: float) -> None:
-        self.given_before_until = (
-            -1
-        )  # an earlier incarnation of the coordinator may have given jobs up to this generation
+        # An earlier incarnation of the coordinator may have given jobs up to this generation.
+        self.given_before_until = -1
         self._pending: dict[bytes, PendingJob] = {}
         self._tags: dict[bytes, bytes] = {}  # first bytes of a digest -> digest
         self._queue: list[tuple[int, bytes]] = []  # candidates' jobs, in order of offer
@@ -170,10 +169,8 @@ class PendingJobs(Mapping[bytes, PendingJob]):
         R3: a wanted job goes into the queue, so some worker will get it.
         """
         for each in work:
-            digest = each.digest
-            if digest in self._pending or digest in self._accepted:
-                continue
-            self._add(PendingJob(each, self._next_order))
+            if each.digest not in self._pending and each.digest not in self._accepted:
+                self._add(PendingJob(each, self._next_order))
 
     def _add(self, pending: PendingJob) -> None:
         digest = pending.work.digest

@@ -35,7 +35,8 @@ def dump(strategy: Any) -> dict[str, NDArray[Any]]:
         if isinstance(value, np.ndarray):
             arrays[path] = value.copy()
         elif isinstance(value, (list, range)):
-            about[path] = ["list", len(value), [_tag(item) for item in value]]
+            tags = [["array"] if isinstance(item, np.ndarray) else tag(item) for item in value]
+            about[path] = ["list", len(value), tags]
             for index, item in enumerate(value):
                 if isinstance(item, np.ndarray):
                     arrays[f"{path}.{index}"] = item.copy()
@@ -79,10 +80,6 @@ def _is_leaf(value: Any) -> bool:
     if type(value) in (list, range):  # the indices of mirrored samples are a range
         return all(isinstance(item, (*SCALARS, np.ndarray)) for item in value)
     return isinstance(value, SCALARS) or type(value) is np.ndarray
-
-
-def _tag(value: Any) -> list[Any]:
-    return ["array"] if isinstance(value, np.ndarray) else tag(value)
 
 
 def _value(path: str, about: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Any:

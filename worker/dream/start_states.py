@@ -46,7 +46,8 @@ class StartStates:
 
         `BundleError` if the share needs recorded states and there are none, or they belong to another model.
         """
-        check_recorded_share(share)
+        if not 0 <= share <= 1:
+            raise UsageError(f"the share of dreams that start at recorded states must be from 0 to 1, not {share}")
         initial, width = read_float_array(bundle.read(INITIAL_LATENTS_PART)), 2 * bundle.manifest.latent + len(empty)
         doubled = EIGHT_BITS in bundle.manifest.models
         if not share:
@@ -83,9 +84,3 @@ class StartStates:
         latent = self.initial.shape[2]
         mu, logvar, memory = np.split(self.recorded[index], [latent, 2 * latent])
         return StartState(mu, logvar, memory)
-
-
-def check_recorded_share(share: float) -> None:
-    """`UsageError` unless it is from 0 to 1."""
-    if not 0 <= share <= 1:
-        raise UsageError(f"the share of dreams that start at recorded states must be from 0 to 1, not {share}")

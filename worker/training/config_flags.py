@@ -1,12 +1,11 @@
 """Flags, and keys of `--set`, that override a preset's training and layers, one per field."""
 
 import argparse
-import types
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields, replace
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from dreamfleet.common.cli.config import configurable_fields, read_settings
+from dreamfleet.common.cli.config import configurable_fields, read_settings, without_none
 from dreamfleet.common.cli.parser import Parser
 from dreamfleet.common.errors import UsageError
 
@@ -121,8 +120,7 @@ def _describe_defaults(values: Mapping[str, Any]) -> str:
 
 
 def _options(hint: Any) -> dict[str, Any]:
-    if get_origin(hint) in (Union, types.UnionType):
-        hint = next(each for each in get_args(hint) if each is not type(None))
+    hint = without_none(hint)
     if get_origin(hint) is Literal:
         return {"choices": get_args(hint)}
     if get_origin(hint) is tuple:
