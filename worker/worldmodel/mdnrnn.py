@@ -12,7 +12,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dreamfleet.worker.worldmodel.columns import in_columns, in_no_column, join, share_weights
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig, Reward
+
+COLUMN_REACH = 2  # columns that a unit sees on each side of its own
 
 
 class Prediction(NamedTuple):
@@ -45,10 +48,27 @@ class MDNRNN(nn.Module):  # mdnrnn_graph.py writes the same step as ONNX
             self._second_bias.zero_()
         self._second_bias.requires_grad_(False)
         self.heads = nn.Linear(config.hidden, config.outputs)
+        if config.columns:
+            self._share_weights()
         if config.window:  # docs/explanation/sources.md, docs/explanation/decisions.md
             self.keys = nn.Linear(config.latent + config.actions, config.attention_units)
             self.query = nn.Linear(config.hidden, config.attention_units, bias=False)
             self.score = nn.Linear(config.attention_units, 1, bias=False)
+
+    def _share_weights(self) -> None:
+        config = self.config
+        side = config.latent // config.columns
+        units = config.column_units * side
+        hidden = join(in_columns(units, side), in_no_column(config.hidden - units))
+        step = join(in_columns(config.latent, side), in_no_column(config.actions))
+        inputs = [step, in_no_column(int(config.previous_reward)), *([step] if config.window else [])]
+        latents = in_columns(config.latent, side)
+        mixtures = join(*[latents] * config.mixtures).reshape(config.mixtures, -1, 2).transpose(0, 1).flatten(0, 1)
+        weights = in_no_column(config.mixtures) if config.joint else mixtures
+        others = in_no_column(config.has_reward_head + config.done)
+        share_weights(self.lstm, "weight_ih_l0", join(*[hidden] * 4), join(*inputs), COLUMN_REACH)
+        share_weights(self.lstm, "weight_hh_l0", join(*[hidden] * 4), hidden, COLUMN_REACH)
+        share_weights(self.heads, "weight", join(weights, mixtures, mixtures, others), hidden, COLUMN_REACH)
 
     @property
     def _second_bias(self) -> Tensor:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from dreamfleet.common.cli.config import option
 from dreamfleet.common.errors import UsageError
+from dreamfleet.common.printable import plural
 from dreamfleet.common.schema.validation import added_option
 from dreamfleet.worker.worldmodel.config_fields import check_factors, check_sizes, loss_factor
 
@@ -54,6 +55,9 @@ class MDNRNNConfig:
     )
 
     joint: bool = added_option(default=False, text="a mixture of all latents together, in place of one a latent")
+    columns: int = added_option(
+        0, "latents of each column, as the VAE's: three of four units of the LSTM then lie in columns and share weights"
+    )
 
     def __post_init__(self) -> None:
         check_sizes(self)
@@ -65,6 +69,11 @@ class MDNRNNConfig:
             raise UsageError("the previous reward as an input needs a reward head: in a dream nothing else predicts it")
         if self.lost < 0 or (self.lost and not self.done):
             raise UsageError("lost is a number of steps that a done head predicts: give done=true, and 0 or more")
+        if self.columns < 0 or (self.columns and (self.latent % self.columns or not self.column_units)):
+            raise UsageError(
+                f"columns is as many latents as the VAE has for each column, and the LSTM has a unit for each or more; "
+                f"not {self.columns} of {self.latent} with {plural(self.hidden, 'unit')}"
+            )
         check_factors(self, "z_factor", "reward_factor", "done_factor", "done_weight")
         if self.reward_factor != 1 and self.reward == "none":
             raise UsageError("reward_factor is the weight of a reward head's loss: give another reward than none")
@@ -88,6 +97,11 @@ class MDNRNNConfig:
     def lstm_inputs(self) -> int:
         """The size of the LSTM's input: `inputs`, and the attention's weighted sum."""
         return self.inputs + (self.latent + self.actions if self.window else 0)
+
+    @property
+    def column_units(self) -> int:
+        """The units of the LSTM that lie in each column: three of four units, the others see all columns."""
+        return self.hidden * 3 // 4 * self.columns // self.latent
 
     @property
     def has_reward_head(self) -> bool:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dreamfleet.worker.worldmodel.columns import in_columns, share_weights
 from dreamfleet.worker.worldmodel.vae_config import LEAK, ConvolutionLayer, VAEConfig
 
 
@@ -63,18 +64,6 @@ class Up(nn.ConvTranspose2d):
         return whole[..., : -self._more, : -self._more] if self._more else whole
 
 
-class NearLinear(nn.Linear):
-    """A linear layer of which only the weights learn that `near` (outputs, inputs) names; the others stay 0."""
-
-    def __init__(self, near: Tensor) -> None:
-        outputs, inputs = near.shape
-        super().__init__(inputs, outputs)
-        self.register_buffer("near", near.float(), persistent=False)
-        with torch.no_grad():  # an output begins as large as that of a layer with as many inputs as it has
-            self.weight.mul_(near * (inputs / near.sum(dim=1, keepdim=True)).sqrt())
-        self.weight.register_hook(lambda gradient: gradient * self.near)  # type: ignore[no-untyped-call]
-
-
 class VAE(nn.Module):
     """Maps pictures `(N, 3, side, side)` in [0, 1] to mu and logvar `(N, latent)`, and latents back to pictures."""
 
@@ -87,11 +76,14 @@ class VAE(nn.Module):
         self.encoder = nn.Sequential(*layers, nn.Flatten())
         self._start = (config.up[0].inputs, *[config.decoder_sides[0]] * 2)
         flat = self._start[0] * self._start[1] ** 2
-        near = _near_columns(config) if config.columns else None
-        self.mu, self.logvar = (
-            nn.Linear(config.flat, config.latent) if near is None else NearLinear(near) for _ in range(2)
-        )
-        self.dense = nn.Linear(config.latent, flat) if near is None else NearLinear(near.T)
+        self.mu, self.logvar = (nn.Linear(config.flat, config.latent) for _ in range(2))
+        self.dense = nn.Linear(config.latent, flat)
+        if config.columns:
+            latents, map_ = (in_columns(count, config.sides[-1]) for count in (config.latent, flat))
+            for layer, outputs, inputs in (
+                (self.mu, latents, map_), (self.logvar, latents, map_), (self.dense, map_, latents)
+            ):  # fmt: skip
+                share_weights(layer, "weight", outputs, inputs, reach=1)
         layers = []
         for each in config.up:
             layers += [Up(each), *_layers_after(config, each.outputs)]
@@ -132,13 +124,6 @@ class VAE(nn.Module):
             scale, floored = 1.0, divergence.clamp(min=self.config.kl_tolerance * self.config.latent)
         weighted = self.config.error_factor * (scale * weighed) + floored.mean()
         return VAELoss(weighted, scale * error + floored.mean(), error, divergence.mean())
-
-
-def _near_columns(config: VAEConfig) -> Tensor:
-    """Whether a latent's column is an output's, or beside it: `(latent, flat)`."""
-    side = config.sides[-1]
-    latent, output = torch.arange(config.latent)[:, None] % side, torch.arange(config.flat)[None] % side
-    return (latent - output).abs() <= 1
 
 
 def _layers_after(config: VAEConfig, channels: int) -> list[nn.Module]:
