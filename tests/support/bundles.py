@@ -87,9 +87,7 @@ def random_rnn_weights(seed=0, rnn=REWARDED):
     weights.draw("lstm.weight_hh_l0", (4 * rnn.hidden, rnn.hidden), rnn.hidden)
     weights.draw("lstm.bias_ih_l0", 4 * rnn.hidden, rnn.hidden)
     weights["lstm.bias_hh_l0"] = np.zeros(4 * rnn.hidden, np.float32)  # one bias as in the sources
-    if rnn.head_units:
-        weights.add_dense("head_layer", rnn.inputs + rnn.hidden, rnn.head_units)
-    weights.add_dense("heads", rnn.head_units or rnn.hidden, rnn.outputs)
+    weights.add_dense("heads", rnn.hidden, rnn.outputs)
     if rnn.window:
         weights.add_dense("keys", rnn.latent + rnn.actions, rnn.attention_units)
         weights.draw("query.weight", (rnn.attention_units, rnn.hidden), rnn.hidden)

@@ -47,9 +47,7 @@ class MDNRNN(nn.Module):  # mdnrnn_graph.py writes the same step as ONNX
         with torch.no_grad():  # one bias as in the sources, though torch adds two
             self._second_bias.zero_()
         self._second_bias.requires_grad_(False)
-        if config.head_units:
-            self.head_layer = nn.Linear(config.inputs + config.hidden, config.head_units)
-        self.heads = nn.Linear(config.head_units or config.hidden, config.outputs)
+        self.heads = nn.Linear(config.hidden, config.outputs)
         if config.columns:
             self._share_weights()
         if config.window:  # docs/explanation/sources.md, docs/explanation/decisions.md
@@ -60,21 +58,16 @@ class MDNRNN(nn.Module):  # mdnrnn_graph.py writes the same step as ONNX
     def _share_weights(self) -> None:
         config = self.config
         side = config.latent // config.columns
+        units = config.column_units * side
         latents = in_columns(config.latent, side)
-        hidden, head_units = (
-            join(in_columns(count * side, side), in_no_column(units - count * side))
-            for units, count in ((config.hidden, config.column_units), (config.head_units, config.head_units // side))
-        )
+        hidden = join(in_columns(units, side), in_no_column(config.hidden - units))
         inputs = join(latents, in_no_column(config.inputs - config.latent))
         gates = join(*[hidden] * 4)
         share_weights(self.lstm, "weight_ih_l0", gates, inputs, COLUMN_REACH)
         share_weights(self.lstm, "weight_hh_l0", gates, hidden, COLUMN_REACH)
-        if config.head_units:
-            share_weights(self.head_layer, "weight", head_units, join(inputs, hidden), COLUMN_REACH)
         mixtures = join(*[latents] * config.mixtures).reshape(config.mixtures, -1, 2).transpose(0, 1).flatten(0, 1)
         others = in_no_column(config.has_reward_head + config.done)
-        outputs = join(mixtures, mixtures, mixtures, others)
-        share_weights(self.heads, "weight", outputs, head_units if config.head_units else hidden, COLUMN_REACH)
+        share_weights(self.heads, "weight", join(mixtures, mixtures, mixtures, others), hidden, COLUMN_REACH)
 
     @property
     def _second_bias(self) -> Tensor:
@@ -83,12 +76,12 @@ class MDNRNN(nn.Module):  # mdnrnn_graph.py writes the same step as ONNX
     def forward(self, inputs: Tensor) -> Prediction:
         """Predict each step of sequences that begin with a zero state."""
         hidden: Tensor = self._run_with_attention(inputs) if self.config.window else self.lstm(inputs)[0]
-        return self.predict(self._features(inputs, hidden))
+        return self.predict(hidden)
 
-    def predict(self, features: Tensor) -> Prediction:
-        """Apply the heads to `(..., hidden)` or `(..., head_units)` of `advance`."""
+    def predict(self, hidden: Tensor) -> Prediction:
+        """Apply the heads to hidden states `(..., hidden)`."""
         config = self.config
-        out = self.heads(functional.dropout(features, config.dropout, self.training))
+        out = self.heads(functional.dropout(hidden, config.dropout, self.training))
         rows = (config.weighted, config.latent, config.latent)
         ends = config.mixtures * sum(rows)
         parts = out[..., :ends].split([config.mixtures * count for count in rows], dim=-1)
@@ -100,9 +93,7 @@ class MDNRNN(nn.Module):  # mdnrnn_graph.py writes the same step as ONNX
         return Prediction(functional.log_softmax(weights, dim=-1), means, deviations, reward, done)
 
     def advance(self, steps: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Step on latents and actions `(N, latent + actions)` from a state `(N, state)`.
-
-        Return what the heads see, the LSTM's output or the layer behind it, and the next state.
+        """Step on latents and actions `(N, latent + actions)` from a state `(N, state)`; return hidden and next state.
 
         The previous reward comes from the state; the next state keeps it until the caller writes the new one.
         """
@@ -114,14 +105,8 @@ class MDNRNN(nn.Module):  # mdnrnn_graph.py writes the same step as ONNX
             window = torch.cat([window[:, steps.shape[1] :], steps], dim=1)
             seen = window.reshape(-1, config.window, steps.shape[1])
             inputs.append(self._attend(seen, self.keys(seen), hidden))
-        seen = torch.cat(inputs, dim=1)
-        hidden, cell = self._cell(seen, hidden, cell)
-        return self._features(seen, hidden), torch.cat([hidden, cell, previous, window], dim=1)
-
-    def _features(self, inputs: Tensor, hidden: Tensor) -> Tensor:
-        if not self.config.head_units:
-            return hidden
-        return torch.tanh(self.head_layer(torch.cat([inputs, hidden], dim=-1)))
+        hidden, cell = self._cell(torch.cat(inputs, dim=1), hidden, cell)
+        return hidden, torch.cat([hidden, cell, previous, window], dim=1)
 
     def _run_with_attention(self, inputs: Tensor) -> Tensor:
         config = self.config

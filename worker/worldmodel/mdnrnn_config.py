@@ -55,9 +55,6 @@ class MDNRNNConfig:
     )
 
     joint: bool = added_option(default=False, text="a mixture of all latents together, in place of one a latent")
-    head_units: int = added_option(
-        0, "units of a layer between LSTM and heads, which sees latents and action too; 0: none"
-    )
     columns: int = added_option(
         0, "latents of each column, as the VAE's: three of four units of the LSTM then lie in columns and share weights"
     )
@@ -72,8 +69,8 @@ class MDNRNNConfig:
             raise UsageError("the previous reward as an input needs a reward head: in a dream nothing else predicts it")
         if self.lost < 0 or (self.lost and not self.done):
             raise UsageError("lost is a number of steps that a done head predicts: give done=true, and 0 or more")
-        if min(self.head_units, self.columns) < 0 or ((self.head_units or self.columns) and self._is_of_another_kind):
-            raise UsageError("columns and head_units are from 0, without dropout, a window or joint mixtures")
+        if self.columns < 0 or (self.columns and (self.window or self.joint)):
+            raise UsageError("columns are from 0, and go without a window and joint mixtures")
         if self.columns and (self.latent % self.columns or not self.column_units):
             raise UsageError(
                 f"columns is as many latents as the VAE has for each column, and the LSTM has a unit for each or more; "
@@ -102,10 +99,6 @@ class MDNRNNConfig:
     def lstm_inputs(self) -> int:
         """The size of the LSTM's input: `inputs`, and the attention's weighted sum."""
         return self.inputs + (self.latent + self.actions if self.window else 0)
-
-    @property
-    def _is_of_another_kind(self) -> bool:
-        return bool(self.dropout or self.window or self.joint)
 
     @property
     def column_units(self) -> int:

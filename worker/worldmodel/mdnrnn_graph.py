@@ -40,16 +40,6 @@ class RecurrentGraph:
         self.hidden, self._cell = lstm(graph, inputs, self.hidden, self._cell, self._rnn, self._ranges)
         return self.hidden
 
-    def head_layer(self, latent: str, action: str) -> str:
-        """Add the layer between the LSTM, after `advance`, and the heads."""
-        graph, rnn = self._graph, self._rnn
-        joined = graph.join(latent, action, self._previous, self.hidden)
-        kernel, bias = rnn["head_layer.weight"].T, rnn["head_layer.bias"]
-        if not self._ranges:
-            return graph.node("Tanh", graph.node("Gemm", joined, graph.weight(kernel), graph.constant(bias)))
-        widths = _widths(self._ranges, self._config.hidden)
-        return graph.node("Tanh", add_input_product(graph, round_inputs(graph, joined, widths), kernel, bias, widths))
-
     def next_state(self, previous: str = "") -> str:
         """The state after `advance`, laid out as in `MDNRNNConfig.state`; `previous` is the reward head's label."""
         return self._graph.join(self.hidden, self._cell, previous or self._previous, self._window)
@@ -80,7 +70,7 @@ def lstm(
     bias = weights["lstm.bias_ih_l0"] + weights["lstm.bias_hh_l0"]
     rows = [slice(gate * size, (gate + 1) * size) for gate in range(4)]
     joined = graph.join(*inputs, hidden)
-    widths = _widths(ranges, size)
+    widths = np.array([*ranges, *[1.0] * size], np.float32)  # the hidden state is below 1
     rounded = round_inputs(graph, joined, widths) if ranges else ""
 
     def gate_product(gate: slice) -> str:
@@ -95,11 +85,6 @@ def lstm(
     kept = graph.node("Mul", forget, cell)
     cell = graph.node("Add", kept, graph.node("Mul", enter, candidate))
     return graph.node("Mul", leave, graph.node("Tanh", cell)), cell
-
-
-def _widths(ranges: Sequence[float], size: int) -> NDArray[np.float32]:
-    """The magnitudes of the LSTM's inputs and of a hidden state, which is below 1."""
-    return np.array([*ranges, *[1.0] * size], np.float32)
 
 
 def window_input(graph: GraphBuilder, latent: str, action: str, config: MDNRNNConfig) -> str:
@@ -126,8 +111,6 @@ def export_dream(rnn: Weights, config: MDNRNNConfig, ranges: Ranges | None = Non
     temperature = graph.add_scalar_input("temperature")
     recurrent = RecurrentGraph(graph, state, rnn, config, ranges)
     hidden = recurrent.advance(latent, action)
-    if config.head_units:
-        hidden = recurrent.head_layer(latent, action)
     if config.dropout:
         hidden = graph.node("Mul", hidden, graph.add_input("mask", kind, config.hidden))
     heads = _heads(graph, hidden, rnn, config, ranges)
@@ -159,7 +142,7 @@ def _heads(graph: GraphBuilder, hidden: str, rnn: Weights, config: MDNRNNConfig,
     order = mixture_major_order(config)
     kernel, bias = rnn["heads.weight"][order].T, rnn["heads.bias"][order]
     if _is_rounded(ranges):
-        widths = np.full(len(kernel), 1 / (1 - config.dropout), np.float32)  # the values are below 1
+        widths = np.full(config.hidden, 1 / (1 - config.dropout), np.float32)  # the hidden state is below 1
         return add_input_product(graph, round_inputs(graph, hidden, widths), kernel, bias, widths)
     # In half precision: the bundle holds the LSTM twice already, and its size is limited.
     return graph.node("Gemm", hidden, graph.weight(kernel), graph.constant(bias))

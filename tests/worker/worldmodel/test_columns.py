@@ -12,7 +12,6 @@ from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 CONFIGS = {
     "plain": MDNRNNConfig(latent=32, columns=2, hidden=68, mixtures=3, reward="none"),
     "heads": MDNRNNConfig(latent=32, columns=2, hidden=64, done=True, previous_reward=True),
-    "head layer": MDNRNNConfig(latent=32, columns=2, hidden=64, head_units=40, done=True),
 }
 
 
@@ -54,8 +53,6 @@ def test_an_mdnrnns_shared_weights_stay_equal_and_the_others_zero(name):
     check_shared(model.lstm.weight_ih_l0, model.lstm.weight_ih_l0_places)
     check_shared(model.lstm.weight_hh_l0, model.lstm.weight_hh_l0_places)
     check_shared(model.heads.weight, model.heads.weight_places)
-    if config.head_units:
-        check_shared(model.head_layer.weight, model.head_layer.weight_places)
 
 
 def test_what_lies_a_column_beside_another_moves_units_and_predictions_by_a_column():

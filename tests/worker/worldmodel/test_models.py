@@ -101,7 +101,8 @@ def test_the_latents_of_a_column_see_nothing_far_from_it_before_and_after_traini
 
 
 @pytest.mark.parametrize(
-    "config", [mdnrnn.REWARDED, mdnrnn.NOTEBOOK, mdnrnn.ATTENTIVE, MDNRNNConfig(joint=True), MDNRNNConfig(head_units=9)]
+    "config",
+    [mdnrnn.REWARDED, mdnrnn.NOTEBOOK, mdnrnn.ATTENTIVE, MDNRNNConfig(joint=True), MDNRNNConfig(columns=4, done=True)],
 )
 def test_step_by_step_is_the_same_as_a_whole_drive(config):
     torch.manual_seed(0)
@@ -224,8 +225,7 @@ VARIANTS = {
     "done": MDNRNNConfig(done=True, reward="none"),
     "everything": MDNRNNConfig(reward="value", done=True, previous_reward=True, dropout=0.2, window=3),
     "one mixture": MDNRNNConfig(mixtures=1),
-    "head layer": MDNRNNConfig(head_units=20, done=True, previous_reward=True),
-    "columns": MDNRNNConfig(columns=2, head_units=48, hidden=64),
+    "columns": MDNRNNConfig(columns=2, hidden=64, done=True, previous_reward=True),
     "joint": MDNRNNConfig(joint=True, reward="value", done=True),
     "joint latent": MDNRNNConfig(joint=True, latent=1),
 }
@@ -234,8 +234,7 @@ VARIANTS = {
 def dreamt_in_torch(model, feed, temperature, mask):
     """The same step in torch: softmax, cumulative sum, the first entry beyond `uniform`."""
     config = model.config
-    for layer in (model.heads, model.head_layer) if config.head_units else (model.heads,):
-        layer.weight.data = layer.weight.data.half().float()  # as the bundle keeps them
+    model.heads.weight.data = model.heads.weight.data.half().float()  # as the bundle keeps them
     tensors = {name: torch.from_numpy(each) for name, each in feed.items()}
     with torch.no_grad():
         hidden, state = model.advance(torch.cat([tensors["latent"], tensors["action"]], dim=1), tensors["state"])

@@ -54,8 +54,6 @@ def mdnrnn_weights(dream: bytes, config: MDNRNNConfig) -> Weights:
     entering, staying = np.split(kernel, [config.lstm_inputs], axis=1)
     found |= {"lstm.weight_ih_l0": entering, "lstm.weight_hh_l0": staying}
     found |= {"lstm.bias_ih_l0": bias, "lstm.bias_hh_l0": np.zeros_like(bias)}
-    if config.head_units:
-        found |= _pair("head_layer", constants, transposed=True)
     back = np.argsort(mixture_major_order(config))
     heads = _pair("heads", constants, transposed=True)
     if len(heads["heads.bias"]) != len(back):

@@ -137,20 +137,6 @@ def test_it_sees_and_dreams_nearly_as_before(whole, rounded):
     assert 0 < np.abs(kept[1] - kept[0]).max() < 0.02
 
 
-def test_a_layer_before_the_heads_is_rounded_too_and_dreams_nearly_as_before(tmp_path):
-    whole = write_random_bundle(tmp_path / "a.zip", 3, EYES, replace(MEMORY, head_units=7, done=True))
-    rounded, rng = write_eight_bit_bundle(whole, tmp_path / "b.zip"), np.random.default_rng(2)
-    latent, action, normal = (rng.uniform(-1, 1, (8, size)).astype(np.float32) for size in (4, 3, 4))
-    state = DreamStep(whole).zero_state(8)
-    one, other = (
-        DreamStep(each).imagine(latent, action, state, np.abs(latent), normal, 1.0) for each in (whole, rounded)
-    )
-    assert 0 < np.abs(other.latent - one.latent).max() < 0.05
-    assert 0 < np.abs(other.done - one.done).max() < 0.02
-    alone = DreamStep(rounded).imagine(*(each[:1] for each in (latent, action, state, np.abs(latent), normal)), 1.0)
-    assert all((row[0] == all_[0]).all() for row, all_ in zip(alone, other, strict=True))
-
-
 @pytest.mark.parametrize("memory", [MEMORY, replace(MEMORY, done=True)])
 def test_a_row_has_the_bits_that_it_has_alone_and_reality_those_of_dreams(tmp_path, memory):
     rounded = write_eight_bit_bundle(write_random_bundle(tmp_path / "a.zip", 3, EYES, memory), tmp_path / "b.zip")
@@ -275,7 +261,6 @@ def plain(tmp_path):
         )),
         *((NARROW, replace(MEMORY, **memory)) for memory in (
             {"done": True, "lost": 9}, {"reward": "none", "mixtures": 1}, {"joint": True, "done": True},
-            {"head_units": 7, "done": True}, {"head_units": 7, "previous_reward": True},
             {"reward": "value", "previous_reward": True, "dropout": 0.1},
         )),
         (NARROW, replace(ATTENTIVE, latent=4, hidden=6, window=3, attention_units=5)),
