@@ -69,9 +69,16 @@ def random_vae_weights(seed=0, vae=PAPER):
         weights.add_layer(name, shape, layer.inputs * layer.kernel**2, layer.outputs)
         if vae.batch_norm:
             weights.add_norm(f"encoder.{number * vae.modules_a_layer + 1}", layer.outputs)
-    weights.add_dense("mu", vae.flat, vae.latent)
-    weights.add_dense("logvar", vae.flat, vae.latent)
-    weights.add_dense("dense", vae.latent, vae.up[0].inputs * vae.decoder_sides[0] ** 2)
+    first, side = vae.up[0].inputs, vae.decoder_sides[0]
+    if vae.columns:
+        for name in ("mu", "logvar"):
+            inputs = vae.channels[-1]
+            weights.add_layer(name, (vae.columns, inputs, side, 3), inputs * side * 3, vae.columns)
+        weights.add_layer("dense", (vae.columns, first, side, 3), vae.columns * 3, first)
+    else:
+        weights.add_dense("mu", vae.flat, vae.latent)
+        weights.add_dense("logvar", vae.flat, vae.latent)
+        weights.add_dense("dense", vae.latent, first * side**2)
     for number, layer in enumerate(vae.up):
         name = f"decoder.{number * vae.modules_a_layer}"
         shape = (layer.inputs, layer.outputs, layer.kernel, layer.kernel)

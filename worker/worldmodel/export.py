@@ -31,6 +31,7 @@ __all__ = [
     "squash",
 ]
 EPSILON = 1e-5  # of torch's batch normalisation
+BESIDE = (0, 1, 0, 1)  # padding of a layer between map and columns
 
 
 def export_encoder(vae: Weights, config: VAEConfig, ranges: Ranges | None = None) -> bytes:
@@ -66,7 +67,11 @@ def export_decoder(vae: Weights, config: VAEConfig) -> bytes:
     graph = GraphBuilder("decoder")
     latent = graph.add_input("latent", TensorProto.FLOAT, config.latent)
     kernel, bias = graph.weight(vae["dense.weight"]), graph.weight(vae["dense.bias"])
-    value = graph.node("Gemm", latent, kernel, bias, transB=1)
+    if config.columns:
+        value = graph.node("Reshape", latent, graph.shape(-1, config.columns, 1, config.decoder_sides[0]))
+        value = graph.node("ConvTranspose", value, kernel, bias, pads=BESIDE)
+    else:
+        value = graph.node("Gemm", latent, kernel, bias, transB=1)
     value = _activate(graph, value, config) if config.activate_dense else value
     side, last = config.decoder_sides[0], len(config.up) - 1
     value = graph.node("Reshape", value, graph.shape(-1, config.up[0].inputs, side, side))
@@ -138,6 +143,8 @@ def _encode(
         value = graph.node("Cast", value, to=TensorProto.FLOAT)
         for index in layers:
             value = _convolve(graph, value, vae, config, index)
+        if config.columns:
+            return lambda name: _convolve_columns(graph, value, vae, config, name)
         flat = graph.node("Reshape", value, graph.shape(-1, config.flat))
         return lambda name: graph.linear(flat, vae[f"{name}.weight"].T, vae[f"{name}.bias"])
     step = PIXEL_STEP
@@ -146,7 +153,25 @@ def _encode(
         value = add_convolution(graph, value, *_folded(vae, "encoder", index, config), steps, window)
         step = steps[1]
     whole = graph.node("Reshape", value, graph.shape(-1, config.flat))
-    return lambda name: add_product(graph, whole, vae[f"{name}.weight"].T, vae[f"{name}.bias"], step)
+    return lambda name: add_product(graph, whole, *_as_product(vae, config, name), step)
+
+
+def _convolve_columns(graph: GraphBuilder, value: str, vae: Weights, config: VAEConfig, name: str) -> str:
+    """Add a layer that gives each column its latents."""
+    kernel, bias = (graph.constant(vae[f"{name}.{each}"]) for each in ("weight", "bias"))
+    return graph.node("Reshape", graph.node("Conv", value, kernel, bias, pads=BESIDE), graph.shape(-1, config.latent))
+
+
+def _as_product(vae: Weights, config: VAEConfig, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The layer `mu` or `logvar` as a kernel (inputs, outputs) and a bias."""
+    kernel, bias = vae[f"{name}.weight"], vae[f"{name}.bias"]
+    if not config.columns:
+        return kernel.T, bias
+    count, channels, side, _ = kernel.shape
+    product = np.zeros((channels, side, side + 2, count, side), np.float32)  # with a column more at both edges
+    for column in range(side):
+        product[:, :, column : column + 3, :, column] = kernel.transpose(1, 2, 3, 0)
+    return product[:, :, 1:-1].reshape(config.flat, config.latent), np.repeat(bias, side)
 
 
 def _convolve(graph: GraphBuilder, value: str, vae: Weights, config: VAEConfig, index: int) -> str:

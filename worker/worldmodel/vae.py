@@ -4,13 +4,12 @@ A checkpoint has the names of its parameters. `export.py`, `worker/training/chec
 `worker/addons/importing/` read them. Pages: sources.md.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dreamfleet.worker.worldmodel.columns import in_columns, share_weights
 from dreamfleet.worker.worldmodel.vae_config import LEAK, ConvolutionLayer, VAEConfig
 
 
@@ -73,17 +72,18 @@ class VAE(nn.Module):
         layers: list[nn.Module] = []
         for each in config.down:
             layers += [Down(each), *_layers_after(config, each.outputs)]
-        self.encoder = nn.Sequential(*layers, nn.Flatten())
-        self._start = (config.up[0].inputs, *[config.decoder_sides[0]] * 2)
-        flat = self._start[0] * self._start[1] ** 2
-        self.mu, self.logvar = (nn.Linear(config.flat, config.latent) for _ in range(2))
-        self.dense = nn.Linear(config.latent, flat)
-        if config.columns:
-            latents, map_ = (in_columns(count, config.sides[-1]) for count in (config.latent, flat))
-            for layer, outputs, inputs in (
-                (self.mu, latents, map_), (self.logvar, latents, map_), (self.dense, map_, latents)
-            ):  # fmt: skip
-                share_weights(layer, "weight", outputs, inputs, reach=1)
+        self.encoder = nn.Sequential(*layers)
+        first, side = config.up[0].inputs, config.decoder_sides[0]
+        if config.columns:  # a latent sees its column of the map and those beside it, as every other column's does
+            kernel: Any = {"kernel_size": (side, 3), "padding": (0, 1)}
+            layers = [nn.Conv2d(config.channels[-1], config.columns, **kernel) for _ in range(2)]
+            layers.append(nn.ConvTranspose2d(config.columns, first, **kernel))
+        else:
+            layers = [nn.Linear(config.flat, config.latent) for _ in range(2)]
+            layers.append(nn.Linear(config.latent, first * side**2))
+        self.mu, self.logvar, self.dense = layers
+        self._start = (first, side, side)
+        self._latents = (config.columns, 1, side) if config.columns else (config.latent,)
         layers = []
         for each in config.up:
             layers += [Up(each), *_layers_after(config, each.outputs)]
@@ -91,8 +91,9 @@ class VAE(nn.Module):
 
     def encode(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log variance `(N, latent)` of pictures."""
-        flat = self.encoder(pictures)
-        return self.mu(flat), self.logvar(flat)
+        seen = self.encoder(pictures)
+        seen = seen if self.config.columns else seen.flatten(1)
+        return self.mu(seen).flatten(1), self.logvar(seen).flatten(1)
 
     def freeze_encoder(self) -> None:
         """Let only the decoder learn, so that latents, and models trained on them, stay valid."""
@@ -101,7 +102,7 @@ class VAE(nn.Module):
 
     def decode(self, latents: Tensor) -> Tensor:
         """Decode latents `(N, latent)` to pictures `(N, 3, side, side)` in [0, 1]."""
-        dense = self.dense(latents)
+        dense = self.dense(latents.reshape(-1, *self._latents))
         dense = _activation(self.config)(dense) if self.config.activate_dense else dense
         pictures: Tensor = self.decoder(dense.reshape(-1, *self._start))
         return pictures

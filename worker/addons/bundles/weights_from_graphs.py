@@ -35,7 +35,7 @@ def vae_weights(encoder: bytes, decoder: bytes, config: VAEConfig) -> Weights:
     # The export divided it by 255; the single-precision number nearest to the product is the original.
     found["encoder.0.weight"] = (found["encoder.0.weight"].astype(np.float64) * 255).astype(np.float32)
     for name in ("mu", "logvar"):
-        found |= _pair(name, seen, transposed=True)
+        found |= _pair(name, seen, transposed=not config.columns)
     for name in ("dense", *(f"decoder.{layer}" for layer in layers)):
         found |= _pair(name, made)
     return found

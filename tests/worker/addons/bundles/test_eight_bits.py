@@ -257,7 +257,7 @@ def plain(tmp_path):
     [
         *((replace(NARROW, **eyes), MEMORY) for eyes in (
             {}, {"picture": 96, "padding": "same"}, {"dropout": 0.1, "activation": "leaky_relu"}, {"dense": 8},
-            {"activate_dense": True},
+            {"activate_dense": True}, {"columns": 1, "channels": (2, 2, 2, 4), "padding": "same"},
         )),
         *((NARROW, replace(MEMORY, **memory)) for memory in (
             {"done": True, "lost": 9}, {"reward": "none", "mixtures": 1}, {"joint": True, "done": True},
