@@ -94,7 +94,17 @@ def random_rnn_weights(seed=0, rnn=REWARDED):
     weights.draw("lstm.weight_hh_l0", (4 * rnn.hidden, rnn.hidden), rnn.hidden)
     weights.draw("lstm.bias_ih_l0", 4 * rnn.hidden, rnn.hidden)
     weights["lstm.bias_hh_l0"] = np.zeros(4 * rnn.hidden, np.float32)  # one bias as in the sources
-    weights.add_dense("heads", rnn.hidden, rnn.outputs)
+    if rnn.columns:
+        channels, others = 64, rnn.inputs - rnn.latent + rnn.hidden - rnn.units_in_columns
+        seen, outputs = rnn.columns + rnn.column_units, 3 * rnn.mixtures * rnn.columns
+        weights.add_layer("heads.near", (channels, seen, 5), seen * 5, channels)
+        weights.draw("heads.everywhere.weight", (channels, others), others)
+        weights.add_layer("heads.second", (channels, channels, 3), channels * 3, channels)
+        weights.add_layer("heads.mixtures", (outputs, channels, 1), channels, outputs)
+        if rnn.has_reward_head or rnn.done:
+            weights.add_dense("heads.others", channels * rnn.side, rnn.has_reward_head + rnn.done)
+    else:
+        weights.add_dense("heads", rnn.hidden, rnn.outputs)
     if rnn.window:
         weights.add_dense("keys", rnn.latent + rnn.actions, rnn.attention_units)
         weights.draw("query.weight", (rnn.attention_units, rnn.hidden), rnn.hidden)

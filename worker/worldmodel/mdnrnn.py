@@ -15,7 +15,8 @@ from torch.nn import functional
 from dreamfleet.worker.worldmodel.columns import in_columns, in_no_column, join, share_weights
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig, Reward
 
-COLUMN_REACH = 2  # columns that a unit sees on each side of its own
+COLUMN_REACH = 2  # columns that a unit of the LSTM sees on each side of its own
+HEAD_CHANNELS = 64
 
 
 class Prediction(NamedTuple):
@@ -47,8 +48,8 @@ class MDNRNN(nn.Module):  # mdnrnn_graph.py writes the same step as ONNX
         with torch.no_grad():  # one bias as in the sources, though torch adds two
             self._second_bias.zero_()
         self._second_bias.requires_grad_(False)
-        self.heads = nn.Linear(config.hidden, config.outputs)
-        if config.columns:
+        self.heads = ColumnHeads(config) if config.columns else nn.Linear(config.hidden, config.outputs)
+        if config.columns and not self._second_bias.is_meta:  # of which only the shapes are asked
             self._share_weights()
         if config.window:  # docs/explanation/sources.md, docs/explanation/decisions.md
             self.keys = nn.Linear(config.latent + config.actions, config.attention_units)
@@ -57,17 +58,11 @@ class MDNRNN(nn.Module):  # mdnrnn_graph.py writes the same step as ONNX
 
     def _share_weights(self) -> None:
         config = self.config
-        side = config.latent // config.columns
-        units = config.column_units * side
-        latents = in_columns(config.latent, side)
+        side, units = config.side, config.units_in_columns
         hidden = join(in_columns(units, side), in_no_column(config.hidden - units))
-        inputs = join(latents, in_no_column(config.inputs - config.latent))
-        gates = join(*[hidden] * 4)
-        share_weights(self.lstm, "weight_ih_l0", gates, inputs, COLUMN_REACH)
-        share_weights(self.lstm, "weight_hh_l0", gates, hidden, COLUMN_REACH)
-        mixtures = join(*[latents] * config.mixtures).reshape(config.mixtures, -1, 2).transpose(0, 1).flatten(0, 1)
-        others = in_no_column(config.has_reward_head + config.done)
-        share_weights(self.heads, "weight", join(mixtures, mixtures, mixtures, others), hidden, COLUMN_REACH)
+        inputs = join(in_columns(config.latent, side), in_no_column(config.inputs - config.latent))
+        for name, seen in (("weight_ih_l0", inputs), ("weight_hh_l0", hidden)):
+            share_weights(self.lstm, name, join(*[hidden] * 4), seen, COLUMN_REACH)
 
     @property
     def _second_bias(self) -> Tensor:
@@ -76,12 +71,12 @@ class MDNRNN(nn.Module):  # mdnrnn_graph.py writes the same step as ONNX
     def forward(self, inputs: Tensor) -> Prediction:
         """Predict each step of sequences that begin with a zero state."""
         hidden: Tensor = self._run_with_attention(inputs) if self.config.window else self.lstm(inputs)[0]
-        return self.predict(hidden)
+        return self.predict(self._features(inputs, hidden))
 
-    def predict(self, hidden: Tensor) -> Prediction:
-        """Apply the heads to hidden states `(..., hidden)`."""
+    def predict(self, features: Tensor) -> Prediction:
+        """Apply the heads to what `advance` returns, `(..., hidden)` or in columns `(..., inputs + hidden)`."""
         config = self.config
-        out = self.heads(functional.dropout(hidden, config.dropout, self.training))
+        out = self.heads(functional.dropout(features, config.dropout, self.training))
         rows = (config.weighted, config.latent, config.latent)
         ends = config.mixtures * sum(rows)
         parts = out[..., :ends].split([config.mixtures * count for count in rows], dim=-1)
@@ -93,7 +88,9 @@ class MDNRNN(nn.Module):  # mdnrnn_graph.py writes the same step as ONNX
         return Prediction(functional.log_softmax(weights, dim=-1), means, deviations, reward, done)
 
     def advance(self, steps: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Step on latents and actions `(N, latent + actions)` from a state `(N, state)`; return hidden and next state.
+        """Step on latents and actions `(N, latent + actions)` from a state `(N, state)`.
+
+        Return what the heads see, the LSTM's output and in columns the inputs before it, and the next state.
 
         The previous reward comes from the state; the next state keeps it until the caller writes the new one.
         """
@@ -105,8 +102,12 @@ class MDNRNN(nn.Module):  # mdnrnn_graph.py writes the same step as ONNX
             window = torch.cat([window[:, steps.shape[1] :], steps], dim=1)
             seen = window.reshape(-1, config.window, steps.shape[1])
             inputs.append(self._attend(seen, self.keys(seen), hidden))
-        hidden, cell = self._cell(torch.cat(inputs, dim=1), hidden, cell)
-        return hidden, torch.cat([hidden, cell, previous, window], dim=1)
+        seen = torch.cat(inputs, dim=1)
+        hidden, cell = self._cell(seen, hidden, cell)
+        return self._features(seen, hidden), torch.cat([hidden, cell, previous, window], dim=1)
+
+    def _features(self, inputs: Tensor, hidden: Tensor) -> Tensor:
+        return torch.cat([inputs, hidden], dim=-1) if self.config.columns else hidden
 
     def _run_with_attention(self, inputs: Tensor) -> Tensor:
         config = self.config
@@ -134,6 +135,39 @@ class MDNRNN(nn.Module):  # mdnrnn_graph.py writes the same step as ONNX
         enter, forget, candidate, leave = gates.chunk(4, dim=1)
         cell = torch.sigmoid(forget) * cell + torch.sigmoid(enter) * torch.tanh(candidate)
         return torch.sigmoid(leave) * torch.tanh(cell), cell
+
+
+class ColumnHeads(nn.Module):
+    """Heads as convolutions over the columns, which see latents, action and the LSTM's output.
+
+    Where a thing is a step later follows from its place, its speed and what is done: no linear map can tell.
+    """
+
+    def __init__(self, config: MDNRNNConfig) -> None:
+        super().__init__()
+        self._config = config
+        everywhere = config.inputs - config.latent + config.hidden - config.units_in_columns
+        self.near = nn.Conv1d(config.columns + config.column_units, HEAD_CHANNELS, 5, padding=2)
+        self.everywhere = nn.Linear(everywhere, HEAD_CHANNELS, bias=False)
+        self.second = nn.Conv1d(HEAD_CHANNELS, HEAD_CHANNELS, 3, padding=1)
+        self.mixtures = nn.Conv1d(HEAD_CHANNELS, 3 * config.mixtures * config.columns, 1)
+        if config.has_reward_head or config.done:
+            self.others = nn.Linear(HEAD_CHANNELS * config.side, config.has_reward_head + config.done)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Outputs `(..., outputs)` as those of linear heads."""
+        config, side = self._config, self._config.side
+        sizes = [config.latent, config.inputs - config.latent, config.units_in_columns]
+        flat = features.reshape(-1, features.shape[-1])
+        latents, others, units, rest = torch.split(flat, [*sizes, flat.shape[1] - sum(sizes)], dim=1)
+        near = [latents.reshape(-1, config.columns, side), units.reshape(-1, config.column_units, side)]
+        everywhere = self.everywhere(torch.cat([others, rest], dim=1))
+        value = torch.relu(self.near(torch.cat(near, dim=1)) + everywhere[..., None])
+        value = torch.relu(self.second(value))
+        mixtures = self.mixtures(value).reshape(-1, 3, config.mixtures, config.latent).transpose(2, 3).flatten(1)
+        has_others = config.has_reward_head or config.done
+        out = torch.cat([mixtures, self.others(value.flatten(1))], dim=1) if has_others else mixtures
+        return out.reshape(*features.shape[:-1], -1)
 
 
 def latent_loss(prediction: Prediction, targets: Tensor, mask: Tensor) -> Tensor:

@@ -56,7 +56,7 @@ class MDNRNNConfig:
 
     joint: bool = added_option(default=False, text="a mixture of all latents together, in place of one a latent")
     columns: int = added_option(
-        0, "latents of each column, as the VAE's: three of four units of the LSTM then lie in columns and share weights"
+        0, "latents of each column, as the VAE's: units of the LSTM, and convolutions behind it, then lie in columns"
     )
 
     def __post_init__(self) -> None:
@@ -69,8 +69,8 @@ class MDNRNNConfig:
             raise UsageError("the previous reward as an input needs a reward head: in a dream nothing else predicts it")
         if self.lost < 0 or (self.lost and not self.done):
             raise UsageError("lost is a number of steps that a done head predicts: give done=true, and 0 or more")
-        if self.columns < 0 or (self.columns and (self.window or self.joint)):
-            raise UsageError("columns are from 0, and go without a window and joint mixtures")
+        if self.columns < 0 or (self.columns and (self.dropout or self.window or self.joint)):
+            raise UsageError("columns are from 0, and go without dropout, a window and joint mixtures")
         if self.columns and (self.latent % self.columns or not self.column_units):
             raise UsageError(
                 f"columns is as many latents as the VAE has for each column, and the LSTM has a unit for each or more; "
@@ -101,9 +101,19 @@ class MDNRNNConfig:
         return self.inputs + (self.latent + self.actions if self.window else 0)
 
     @property
+    def side(self) -> int:
+        """The number of columns."""
+        return self.latent // self.columns
+
+    @property
     def column_units(self) -> int:
         """The units of the LSTM that lie in each column: three of four units, the others see all columns."""
-        return self.hidden * 3 // 4 * self.columns // self.latent
+        return self.hidden * 3 // 4 // self.side
+
+    @property
+    def units_in_columns(self) -> int:
+        """The units of the LSTM that lie in a column, which are its first."""
+        return self.column_units * self.side
 
     @property
     def has_reward_head(self) -> bool:

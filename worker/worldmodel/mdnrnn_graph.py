@@ -26,13 +26,13 @@ class RecurrentGraph:
         parts = graph.split(
             state, config.hidden, config.hidden, int(config.previous_reward), config.window * self._step
         )
-        self.hidden, self._cell, self._previous, self._window = parts
+        self.hidden, self._cell, self.previous, self._window = parts
         self.attention = ""  # weights (N, window, 1) of the last step
 
     def advance(self, latent: str, action: str) -> str:
         """Add one step; return the next hidden state, which is `hidden` from now on."""
         graph, step = self._graph, window_input(self._graph, latent, action, self._config)
-        inputs = [latent, action, self._previous]
+        inputs = [latent, action, self.previous]
         if self._config.window:
             _, kept = graph.split(self._window, self._step, (self._config.window - 1) * self._step)
             self._window = graph.join(kept, step)
@@ -42,7 +42,7 @@ class RecurrentGraph:
 
     def next_state(self, previous: str = "") -> str:
         """The state after `advance`, laid out as in `MDNRNNConfig.state`; `previous` is the reward head's label."""
-        return self._graph.join(self.hidden, self._cell, previous or self._previous, self._window)
+        return self._graph.join(self.hidden, self._cell, previous or self.previous, self._window)
 
     def _attend(self) -> str:
         graph, rnn, window = self._graph, self._rnn, self._config.window
@@ -110,10 +110,14 @@ def export_dream(rnn: Weights, config: MDNRNNConfig, ranges: Ranges | None = Non
     uniform, normal = graph.add_input("uniform", kind, config.latent), graph.add_input("normal", kind, config.latent)
     temperature = graph.add_scalar_input("temperature")
     recurrent = RecurrentGraph(graph, state, rnn, config, ranges)
+    previous = recurrent.previous
     hidden = recurrent.advance(latent, action)
     if config.dropout:
         hidden = graph.node("Mul", hidden, graph.add_input("mask", kind, config.hidden))
-    heads = _heads(graph, hidden, rnn, config, ranges)
+    if config.columns:
+        heads = _column_heads(graph, latent, graph.join(action, previous), hidden, rnn, config)
+    else:
+        heads = _heads(graph, hidden, rnn, config, ranges)
     columns = graph.split(
         heads, *[config.weighted] * config.mixtures, *[config.latent] * (2 * config.mixtures),
         int(config.has_reward_head), int(config.done),
@@ -146,6 +150,31 @@ def _heads(graph: GraphBuilder, hidden: str, rnn: Weights, config: MDNRNNConfig,
         return add_input_product(graph, round_inputs(graph, hidden, widths), kernel, bias, widths)
     # In half precision: the bundle holds the LSTM twice already, and its size is limited.
     return graph.node("Gemm", hidden, graph.weight(kernel), graph.constant(bias))
+
+
+def _column_heads(
+    graph: GraphBuilder, latent: str, others: str, hidden: str, rnn: Weights, config: MDNRNNConfig
+) -> str:
+    """`ColumnHeads`, with its mixtures in the order of `mixture_major_order`; in single precision with any ranges."""
+
+    def convolve(value: str, name: str, pad: int) -> str:
+        kernel, bias = (graph.constant(rnn[f"heads.{name}.{each}"]) for each in ("weight", "bias"))
+        return graph.node("Conv", value, kernel, bias, pads=[pad, pad])
+
+    units, rest = graph.split(hidden, config.units_in_columns, config.hidden - config.units_in_columns)
+    parts = ((latent, config.columns), (units, config.column_units))
+    seen = graph.join(*(graph.node("Reshape", each, graph.shape(-1, count, config.side)) for each, count in parts))
+    near = convolve(seen, "near", 2)
+    everywhere = graph.linear(graph.join(others, rest), rnn["heads.everywhere.weight"].T)
+    value = graph.node("Relu", graph.node("Add", near, graph.node("Unsqueeze", everywhere, graph.shape(2))))
+    value = graph.node("Relu", convolve(value, "second", 1))
+    size = 3 * config.mixtures * config.latent
+    mixtures = graph.node("Reshape", convolve(value, "mixtures", 0), graph.shape(-1, size))
+    if config.outputs == size:
+        return mixtures
+    kernel = rnn["heads.others.weight"].T
+    flat = graph.node("Reshape", value, graph.shape(-1, len(kernel)))
+    return graph.join(mixtures, graph.linear(flat, kernel, rnn["heads.others.bias"]))
 
 
 def _is_rounded(ranges: Ranges | None) -> bool:

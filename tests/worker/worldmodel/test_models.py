@@ -225,7 +225,8 @@ VARIANTS = {
     "done": MDNRNNConfig(done=True, reward="none"),
     "everything": MDNRNNConfig(reward="value", done=True, previous_reward=True, dropout=0.2, window=3),
     "one mixture": MDNRNNConfig(mixtures=1),
-    "columns": MDNRNNConfig(columns=2, hidden=64, done=True, previous_reward=True),
+    "columns": MDNRNNConfig(columns=2, hidden=64),
+    "columns and heads": MDNRNNConfig(columns=2, hidden=70, done=True, previous_reward=True),
     "joint": MDNRNNConfig(joint=True, reward="value", done=True),
     "joint latent": MDNRNNConfig(joint=True, latent=1),
 }
@@ -234,7 +235,8 @@ VARIANTS = {
 def dreamt_in_torch(model, feed, temperature, mask):
     """The same step in torch: softmax, cumulative sum, the first entry beyond `uniform`."""
     config = model.config
-    model.heads.weight.data = model.heads.weight.data.half().float()  # as the bundle keeps them
+    if not config.columns:
+        model.heads.weight.data = model.heads.weight.data.half().float()  # as the bundle keeps them
     tensors = {name: torch.from_numpy(each) for name, each in feed.items()}
     with torch.no_grad():
         hidden, state = model.advance(torch.cat([tensors["latent"], tensors["action"]], dim=1), tensors["state"])

@@ -54,11 +54,21 @@ def mdnrnn_weights(dream: bytes, config: MDNRNNConfig) -> Weights:
     entering, staying = np.split(kernel, [config.lstm_inputs], axis=1)
     found |= {"lstm.weight_ih_l0": entering, "lstm.weight_hh_l0": staying}
     found |= {"lstm.bias_ih_l0": bias, "lstm.bias_hh_l0": np.zeros_like(bias)}
+    if config.columns:
+        return found | _column_heads(constants, config)
     back = np.argsort(mixture_major_order(config))
     heads = _pair("heads", constants, transposed=True)
     if len(heads["heads.bias"]) != len(back):
         raise _unknown_layout()
     return found | {name: values[back] for name, values in heads.items()}
+
+
+def _column_heads(constants: Iterator[NDArray[np.float32]], config: MDNRNNConfig) -> Weights:
+    found = _pair("heads.near", constants) | {"heads.everywhere.weight": _next(constants).T}
+    found |= _pair("heads.second", constants) | _pair("heads.mixtures", constants)
+    if config.has_reward_head or config.done:
+        found |= _pair("heads.others", constants, transposed=True)
+    return found
 
 
 def _constants(model: bytes) -> Iterator[NDArray[np.float32]]:

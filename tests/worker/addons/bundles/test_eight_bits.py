@@ -137,6 +137,18 @@ def test_it_sees_and_dreams_nearly_as_before(whole, rounded):
     assert 0 < np.abs(kept[1] - kept[0]).max() < 0.02
 
 
+def test_a_model_in_columns_dreams_nearly_as_before(tmp_path):
+    whole = write_random_bundle(tmp_path / "a.zip", 3, EYES, replace(MEMORY, columns=2, done=True))
+    rounded, rng = write_eight_bit_bundle(whole, tmp_path / "b.zip"), np.random.default_rng(2)
+    latent, action, normal = (rng.uniform(-1, 1, (8, size)).astype(np.float32) for size in (4, 3, 4))
+    state = DreamStep(whole).zero_state(8)
+    one, other = (
+        DreamStep(each).imagine(latent, action, state, np.abs(latent), normal, 1.0) for each in (whole, rounded)
+    )
+    assert 0 < np.abs(other.latent - one.latent).max() < 0.05
+    assert 0 < np.abs(other.done - one.done).max() < 0.02
+
+
 @pytest.mark.parametrize("memory", [MEMORY, replace(MEMORY, done=True)])
 def test_a_row_has_the_bits_that_it_has_alone_and_reality_those_of_dreams(tmp_path, memory):
     rounded = write_eight_bit_bundle(write_random_bundle(tmp_path / "a.zip", 3, EYES, memory), tmp_path / "b.zip")
@@ -261,6 +273,8 @@ def plain(tmp_path):
         )),
         *((NARROW, replace(MEMORY, **memory)) for memory in (
             {"done": True, "lost": 9}, {"reward": "none", "mixtures": 1}, {"joint": True, "done": True},
+            {"columns": 2, "done": True},
+            {"columns": 2, "previous_reward": True, "reward": "value"}, {"columns": 2, "reward": "none"},
             {"reward": "value", "previous_reward": True, "dropout": 0.1},
         )),
         (NARROW, replace(ATTENTIVE, latent=4, hidden=6, window=3, attention_units=5)),
