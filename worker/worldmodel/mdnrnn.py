@@ -91,7 +91,6 @@ class MDNRNN(nn.Module):  # mdnrnn_graph.py writes the same step as ONNX
         """Step on latents and actions `(N, latent + actions)` from a state `(N, state)`.
 
         Return what the heads see, the LSTM's output and in columns the inputs before it, and the next state.
-
         The previous reward comes from the state; the next state keeps it until the caller writes the new one.
         """
         config = self.config
@@ -138,10 +137,7 @@ class MDNRNN(nn.Module):  # mdnrnn_graph.py writes the same step as ONNX
 
 
 class ColumnHeads(nn.Module):
-    """Heads as convolutions over the columns, which see latents, action and the LSTM's output.
-
-    Where a thing is a step later follows from its place, its speed and what is done: no linear map can tell.
-    """
+    """Convolutions over the columns, which see latents, action and the LSTM's output."""
 
     def __init__(self, config: MDNRNNConfig) -> None:
         super().__init__()
@@ -157,16 +153,15 @@ class ColumnHeads(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """Outputs `(..., outputs)` as those of linear heads."""
         config, side = self._config, self._config.side
-        sizes = [config.latent, config.inputs - config.latent, config.units_in_columns]
-        flat = features.reshape(-1, features.shape[-1])
-        latents, others, units, rest = torch.split(flat, [*sizes, flat.shape[1] - sum(sizes)], dim=1)
+        ends = [config.latent, config.inputs, config.inputs + config.units_in_columns]
+        latents, seen, units, rest = features.reshape(-1, features.shape[-1]).tensor_split(ends, dim=1)
         near = [latents.reshape(-1, config.columns, side), units.reshape(-1, config.column_units, side)]
-        everywhere = self.everywhere(torch.cat([others, rest], dim=1))
+        everywhere = self.everywhere(torch.cat([seen, rest], dim=1))
         value = torch.relu(self.near(torch.cat(near, dim=1)) + everywhere[..., None])
         value = torch.relu(self.second(value))
         mixtures = self.mixtures(value).reshape(-1, 3, config.mixtures, config.latent).transpose(2, 3).flatten(1)
-        has_others = config.has_reward_head or config.done
-        out = torch.cat([mixtures, self.others(value.flatten(1))], dim=1) if has_others else mixtures
+        others = [self.others(value.flatten(1))] if config.has_reward_head or config.done else []
+        out = torch.cat([mixtures, *others], dim=1)
         return out.reshape(*features.shape[:-1], -1)
 
 
