@@ -96,7 +96,7 @@ def random_rnn_weights(seed=0, rnn=REWARDED):
     weights["lstm.bias_hh_l0"] = np.zeros(4 * rnn.hidden, np.float32)  # one bias as in the sources
     if rnn.columns:
         channels, others = 64, rnn.inputs - rnn.latent + rnn.hidden - rnn.units_in_columns
-        seen, outputs = rnn.columns + rnn.column_units, 3 * rnn.mixtures * rnn.columns
+        seen, outputs = rnn.columns + rnn.column_units, sum(rnn.rows) * rnn.mixtures // rnn.side
         weights.add_layer("heads.near", (channels, seen, 5), seen * 5, channels)
         weights.draw("heads.everywhere.weight", (channels, others), others)
         weights.add_layer("heads.second", (channels, channels, 3), channels * 3, channels)

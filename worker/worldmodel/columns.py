@@ -1,9 +1,4 @@
-"""Layers whose units belong to columns of the picture, see the columns near them, and share weights over all columns.
-
-A thing then moves through the latents and through the memory as it moves through the picture, and what is learnt in
-one column holds in each. A layer stays a dense one with zeros, so bundles, graphs and checkpoints do not differ.
-Pages: train.md.
-"""
+"""An LSTM whose units belong to columns of the picture: what is learnt in one column holds in each. Pages: train.md."""
 
 import torch
 from torch import Tensor, nn
@@ -31,9 +26,8 @@ def join(*groups: Tensor) -> Tensor:
 def share_weights(layer: nn.Module, name: str, outputs: Tensor, inputs: Tensor, reach: int) -> None:
     """Let weights of a layer's parameter `name` `(outputs, inputs)` that lie alike in their columns be one weight.
 
-    `outputs` and `inputs` have the kind and the column of each unit. Units of columns more than `reach` apart are not
-    connected: such weights stay 0. All weights that share begin alike, and their gradients are averaged; so they stay
-    alike with an optimiser that treats each number alike, such as Adam.
+    `outputs` and `inputs` have the kind and the column of each unit. Weights between columns more than `reach` apart
+    stay 0. Weights that share begin alike, and their gradients are averaged, so that Adam keeps them alike.
     """
     weight = layer.get_parameter(name)
     places = _number_weights(outputs, inputs, reach)

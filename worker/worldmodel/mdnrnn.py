@@ -22,7 +22,7 @@ HEAD_CHANNELS = 64
 class Prediction(NamedTuple):
     """The mixtures of the next latents: log weights, means and log deviations `(..., latent, mixtures)`.
 
-    The log weights of a joint mixture are `(..., 1, mixtures)`.
+    The log weights of a joint mixture are `(..., 1, mixtures)`, with columns `(..., side, mixtures)`.
     `reward` (logit or value) and `done` (logit) are `(...)`, and zero without such a head.
     """
 
@@ -77,10 +77,9 @@ class MDNRNN(nn.Module):  # mdnrnn_graph.py writes the same step as ONNX
         """Apply the heads to what `advance` returns, `(..., hidden)` or in columns `(..., inputs + hidden)`."""
         config = self.config
         out = self.heads(functional.dropout(features, config.dropout, self.training))
-        rows = (config.weighted, config.latent, config.latent)
-        ends = config.mixtures * sum(rows)
-        parts = out[..., :ends].split([config.mixtures * count for count in rows], dim=-1)
-        shapes = [(*out.shape[:-1], count, config.mixtures) for count in rows]
+        ends = config.mixtures * sum(config.rows)
+        parts = out[..., :ends].split([config.mixtures * count for count in config.rows], dim=-1)
+        shapes = [(*out.shape[:-1], count, config.mixtures) for count in config.rows]
         weights, means, deviations = (part.reshape(shape) for part, shape in zip(parts, shapes, strict=True))
         none = out.new_zeros(out.shape[:-1])
         reward = out[..., ends] if config.has_reward_head else none
@@ -146,7 +145,7 @@ class ColumnHeads(nn.Module):
         self.near = nn.Conv1d(config.columns + config.column_units, HEAD_CHANNELS, 5, padding=2)
         self.everywhere = nn.Linear(everywhere, HEAD_CHANNELS, bias=False)
         self.second = nn.Conv1d(HEAD_CHANNELS, HEAD_CHANNELS, 3, padding=1)
-        self.mixtures = nn.Conv1d(HEAD_CHANNELS, 3 * config.mixtures * config.columns, 1)
+        self.mixtures = nn.Conv1d(HEAD_CHANNELS, sum(config.rows) * config.mixtures // config.side, 1)
         if config.has_reward_head or config.done:
             self.others = nn.Linear(HEAD_CHANNELS * config.side, config.has_reward_head + config.done)
 
@@ -159,22 +158,20 @@ class ColumnHeads(nn.Module):
         everywhere = self.everywhere(torch.cat([seen, rest], dim=1))
         value = torch.relu(self.near(torch.cat(near, dim=1)) + everywhere[..., None])
         value = torch.relu(self.second(value))
-        mixtures = self.mixtures(value).reshape(-1, 3, config.mixtures, config.latent).transpose(2, 3).flatten(1)
-        others = [self.others(value.flatten(1))] if config.has_reward_head or config.done else []
-        out = torch.cat([mixtures, *others], dim=1)
-        return out.reshape(*features.shape[:-1], -1)
+        parts = self.mixtures(value).flatten(1).split([config.mixtures * count for count in config.rows], dim=1)
+        out = [each.reshape(len(each), config.mixtures, -1).transpose(1, 2).flatten(1) for each in parts]
+        if config.has_reward_head or config.done:
+            out.append(self.others(value.flatten(1)))
+        return torch.cat(out, dim=1).reshape(*features.shape[:-1], -1)
 
 
 def latent_loss(prediction: Prediction, targets: Tensor, mask: Tensor) -> Tensor:
     """Negative log likelihood in nats per latent dimension of `targets` `(N, T, latent)` where `mask` `(N, T)` is 1."""
     scaled = (targets[..., None] - prediction.means) * torch.exp(-prediction.log_deviations)
     log_normal = -0.5 * scaled.square() - prediction.log_deviations - 0.5 * math.log(2 * math.pi)
-    latents = targets.shape[-1]
-    if prediction.log_weights.shape[-2] != latents:  # a joint mixture
-        log_normal = log_normal.sum(dim=-2, keepdim=True)
-        likelihood = torch.logsumexp(prediction.log_weights + log_normal, dim=-1).squeeze(-1) / latents
-    else:
-        likelihood = torch.logsumexp(prediction.log_weights + log_normal, dim=-1).mean(dim=-1)
+    *shape, latents, mixtures = log_normal.shape
+    together = log_normal.reshape(*shape, -1, prediction.log_weights.shape[-2], mixtures).sum(dim=-3)
+    likelihood = torch.logsumexp(prediction.log_weights + together, dim=-1).sum(dim=-1) / latents
     return -(likelihood * mask).sum() / mask.sum().clamp(min=1)
 
 

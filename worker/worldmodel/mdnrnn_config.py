@@ -21,7 +21,8 @@ MOST_REWARD = 1000
 class MDNRNNConfig:
     """Inputs, an LSTM of `hidden` units, `mixtures` Gaussians per latent dimension, and heads.
 
-    A `joint` mixture has one weight per Gaussian, so that a draw takes all latents from the same one.
+    A `joint` mixture has one weight per Gaussian, so that a draw takes all latents from the same one; with
+    `columns` one per Gaussian and column.
 
     The reward head predicts the logit of a positive reward, the logit of the `notebook`'s label (the reward is not
     positive and the episode goes on), or the reward's value. The done head predicts the logit of the episode's end.
@@ -54,7 +55,7 @@ class MDNRNNConfig:
         1.0, "what a reward is divided by before its value is learnt; 0: the rewards' standard deviation in the data"
     )
 
-    joint: bool = added_option(default=False, text="a mixture of all latents together, in place of one a latent")
+    joint: bool = added_option(default=False, text="a mixture of all latents together, or of each column's")
     columns: int = added_option(
         0, "latents of each column, as the VAE's: units of the LSTM, and convolutions behind it, then lie in columns"
     )
@@ -69,8 +70,8 @@ class MDNRNNConfig:
             raise UsageError("the previous reward as an input needs a reward head: in a dream nothing else predicts it")
         if self.lost < 0 or (self.lost and not self.done):
             raise UsageError("lost is a number of steps that a done head predicts: give done=true, and 0 or more")
-        if self.columns < 0 or (self.columns and (self.dropout or self.window or self.joint)):
-            raise UsageError("columns are from 0, and go without dropout, a window and joint mixtures")
+        if self.columns < 0 or (self.columns and (self.dropout or self.window)):
+            raise UsageError("columns are from 0, and go without dropout and a window")
         if self.columns and (self.latent % self.columns or not self.column_units):
             raise UsageError(
                 f"columns is as many latents as the VAE has for each column, and the LSTM has a unit for each or more; "
@@ -128,12 +129,17 @@ class MDNRNNConfig:
     @property
     def outputs(self) -> int:
         """The number of head outputs: log weights, means, log deviations `(latent, mixtures)` each, reward, done."""
-        return self.mixtures * (self.weighted + 2 * self.latent) + self.has_reward_head + self.done
+        return self.mixtures * sum(self.rows) + self.has_reward_head + self.done
 
     @property
     def weighted(self) -> int:
-        """The number of mixtures with weights of their own: one of all latents, or one a latent."""
-        return 1 if self.joint else self.latent
+        """The number of mixtures with weights of their own: one of all latents, one a column, or one a latent."""
+        return self.latent // (self.columns or self.latent if self.joint else 1)
+
+    @property
+    def rows(self) -> tuple[int, int, int]:
+        """How many weights, means and deviations each mixture has."""
+        return self.weighted, self.latent, self.latent
 
     @property
     def state(self) -> int:

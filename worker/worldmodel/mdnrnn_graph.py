@@ -124,7 +124,10 @@ def export_dream(rnn: Weights, config: MDNRNNConfig, ranges: Ranges | None = Non
     )  # fmt: skip
     *mixtures, reward, done = columns
     if config.joint:
-        uniform, _ = graph.split(uniform, 1, config.latent - 1)
+        uniform, _ = graph.split(uniform, config.weighted, config.latent - config.weighted)
+    if config.joint and config.columns:
+        uniform = graph.join(*[uniform] * config.columns)
+        mixtures[: config.mixtures] = (graph.join(*[each] * config.columns) for each in mixtures[: config.mixtures])
     exponential = add_exponential if _is_rounded(ranges) else lambda graph, value: graph.node("Exp", value)
     mean, deviation = _select_mixture(graph, mixtures, uniform, temperature, exponential)
     noise = graph.node("Mul", normal, graph.node("Sqrt", temperature))  # docs/explanation/dreams.md
@@ -168,7 +171,7 @@ def _column_heads(
     everywhere = graph.linear(graph.join(others, rest), rnn["heads.everywhere.weight"].T)
     value = graph.node("Relu", graph.node("Add", near, graph.node("Unsqueeze", everywhere, graph.shape(2))))
     value = graph.node("Relu", convolve(value, "second", 1))
-    size = 3 * config.mixtures * config.latent
+    size = config.mixtures * sum(config.rows)
     mixtures = graph.node("Reshape", convolve(value, "mixtures", 0), graph.shape(-1, size))
     if config.outputs == size:
         return mixtures
@@ -184,7 +187,7 @@ def _is_rounded(ranges: Ranges | None) -> bool:
 def mixture_major_order(config: MDNRNNConfig) -> NDArray[Any]:
     """The heads' rows in the order (kind, mixture, latent) instead of (kind, latent, mixture), to slice mixtures."""
     rows, start = [], 0
-    for latents in (config.weighted, config.latent, config.latent):
+    for latents in config.rows:
         count = latents * config.mixtures
         rows.append(start + np.arange(count).reshape(latents, config.mixtures).T.ravel())
         start += count

@@ -184,18 +184,22 @@ def test_padding_does_not_count():
     assert torch.equal(latent_loss(model(inputs), targets, mask), before)
 
 
-def test_a_joint_mixture_weighs_whole_gaussians():
+@pytest.mark.parametrize("columns", [0, 2])
+def test_a_joint_mixture_weighs_whole_gaussians(columns):
     torch.manual_seed(0)
-    model = MDNRNN(MDNRNNConfig(latent=4, hidden=8, mixtures=3, joint=True))
+    side = 2 if columns else 1
+    model = MDNRNN(MDNRNNConfig(latent=4, hidden=8, mixtures=3, joint=True, columns=columns))
     inputs, targets = torch.randn(2, 5, 7), torch.randn(2, 5, 4)
     predicted = model(inputs)
-    assert predicted.log_weights.shape == (2, 5, 1, 3)
-    gaussians = torch.distributions.Independent(
-        torch.distributions.Normal(predicted.means.mT, predicted.log_deviations.mT.exp()), 1
-    )
-    weights = torch.distributions.Categorical(logits=predicted.log_weights[..., 0, :])
-    mixture = torch.distributions.MixtureSameFamily(weights, gaussians)
-    wanted = -mixture.log_prob(targets).mean() / 4
+    assert predicted.log_weights.shape == (2, 5, side, 3)
+    likelihood = 0
+    for place in range(side):  # a column has every second latent
+        means, deviations = (each[..., place::side, :].mT for each in (predicted.means, predicted.log_deviations.exp()))
+        gaussians = torch.distributions.Independent(torch.distributions.Normal(means, deviations), 1)
+        weights = torch.distributions.Categorical(logits=predicted.log_weights[..., place, :])
+        mixture = torch.distributions.MixtureSameFamily(weights, gaussians)
+        likelihood += mixture.log_prob(targets[..., place::side])
+    wanted = -likelihood.mean() / 4
     assert torch.allclose(latent_loss(predicted, targets, torch.ones(2, 5)), wanted, atol=1e-5)
 
 
@@ -226,6 +230,7 @@ VARIANTS = {
     "everything": MDNRNNConfig(reward="value", done=True, previous_reward=True, dropout=0.2, window=3),
     "one mixture": MDNRNNConfig(mixtures=1),
     "columns": MDNRNNConfig(columns=2, hidden=64),
+    "columns together": MDNRNNConfig(columns=4, hidden=64, joint=True),
     "columns and heads": MDNRNNConfig(columns=2, hidden=70, done=True, previous_reward=True),
     "joint": MDNRNNConfig(joint=True, reward="value", done=True),
     "joint latent": MDNRNNConfig(joint=True, latent=1),
@@ -242,9 +247,9 @@ def dreamt_in_torch(model, feed, temperature, mask):
         hidden, state = model.advance(torch.cat([tensors["latent"], tensors["action"]], dim=1), tensors["state"])
         predicted = model.predict(hidden * torch.as_tensor(mask))
     weights = torch.softmax(predicted.log_weights / temperature, dim=-1)
-    uniform = tensors["uniform"][:, :1] if config.joint else tensors["uniform"]
+    uniform = tensors["uniform"][:, : config.weighted]
     index = (weights.cumsum(dim=-1) <= uniform[..., None]).sum(dim=-1).clamp(max=config.mixtures - 1)
-    index = index.expand(-1, config.latent)
+    index = index.repeat(1, config.latent // config.weighted)
     mean, deviation = (
         each.gather(-1, index[..., None])[..., 0] for each in (predicted.means, predicted.log_deviations)
     )

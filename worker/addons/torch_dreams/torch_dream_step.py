@@ -71,11 +71,12 @@ class TorchDreamStep:
     def _sample(self, predicted: Prediction, noise: StepNoise) -> Tensor:
         """The next latent (N, latent), sampled as `mdnrnn_graph.export_dream` describes."""
         logits, means, deviations, *_ = predicted
-        uniform = noise.uniform[:, :1] if self._config.joint else noise.uniform
+        uniform = noise.uniform[:, : self._config.weighted]
         weights = torch.exp((logits - logits.amax(dim=-1, keepdim=True)) / self._temperature)
         cumulated = weights.cumsum(dim=-1)
         point = uniform[..., None] * cumulated[..., -1:]
-        chosen = (point >= cumulated[..., :-1]).sum(dim=-1, keepdim=True).expand(*means.shape[:-1], 1)
+        chosen = (point >= cumulated[..., :-1]).sum(dim=-1, keepdim=True)
+        chosen = chosen.repeat(1, self._config.latent // self._config.weighted, 1)
         mean, deviation = means.gather(-1, chosen)[..., 0], deviations.gather(-1, chosen)[..., 0]
         sampled: Tensor = mean + torch.exp(deviation) * (noise.normal * self._temperature**0.5)
         return sampled

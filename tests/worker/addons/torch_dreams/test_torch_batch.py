@@ -25,6 +25,7 @@ KINDS = {
     "dropout and previous reward": {"dropout": 0.2, "previous_reward": True},
     "attention and ends": {"window": 3, "attention_units": 5, "done": True},
     "joint mixtures": {"joint": True},
+    "joint mixtures of columns": {"joint": True, "columns": 1},
     "value": {"reward": "value", "previous_reward": True},
 }
 
