@@ -33,8 +33,7 @@ def find_driver(
     foreign checkpoint.
     """
     if is_random(name, runs_dir):
-        if bundle is not None:
-            raise UsageError(f"--controller {name} sees nothing: omit --bundle")
+        _refuse(bundle, name)
         return make_random_agent(name, task, options or {})
     if task is not None or options:
         raise UsageError(
@@ -43,14 +42,21 @@ def find_driver(
     find_network = find_add_on("trained-network")
     network: Agent | None = find_network(Path(name)) if find_network else None
     if network is not None:
+        _refuse(bundle, name)
         return network
     # Heavy, and `baseline train --help` reads this module too.
     from dreamfleet.worker.addons.evaluation.agents import make_agent
 
     controller, beside = find_agent(name, runs_dir)
-    return make_agent(
-        controller, None if isinstance(controller, TrainedAgent) else find_bundle_of(controller, bundle, beside)
-    )
+    if isinstance(controller, TrainedAgent):
+        _refuse(bundle, name)
+        return make_agent(controller, None)
+    return make_agent(controller, find_bundle_of(controller, bundle, beside))
+
+
+def _refuse(bundle: str | None, name: str) -> None:
+    if bundle is not None:
+        raise UsageError(f"--controller {name} has no world model beside it: omit --bundle")
 
 
 def find_agent(name: str, runs_dir: Path) -> tuple[Controller | TrainedAgent, Path | None]:

@@ -19,6 +19,7 @@ from dreamfleet.common.client.client import Client
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.files.atomic_write import check_output_path, open_output
 from dreamfleet.common.host.resource_limits import usable_cores
+from dreamfleet.common.host.stop_signals import interrupted_by_signals
 from dreamfleet.common.protocol.result_bounds import LARGEST_FITNESS
 from dreamfleet.common.runs.lookup import find_bundle_of
 from dreamfleet.common.runs.seeds import TEST
@@ -121,8 +122,9 @@ def run(args: argparse.Namespace) -> int:
         note(f"note: test seeds are {TEST.start} to {TEST.stop - 1}; {some} of these are among them")
     sights, found = ({} if args.blind is None else SIGHTS), None
     try:
-        for each in judge_in_passes(name, agent, seeds, args.jobs, note, sights):
-            found = replace(each, asked_loss=asked)
+        with interrupted_by_signals():
+            for each in judge_in_passes(name, agent, seeds, args.jobs, note, sights):
+                found = replace(each, asked_loss=asked)
     finally:  # a blind pass that is interrupted or fails takes nothing from those before
         if found is not None:
             if missing := [how for sight, how in sights.items() if sight not in found.blind_passes]:

@@ -282,14 +282,17 @@ def test_a_blind_pass_that_cannot_be_driven_takes_nothing_from_those_before(word
     assert (report.figures["hidden_n"], report.figures["foreign_n"]) == (2, None)
 
 
-def test_an_interrupted_blind_pass_takes_nothing_from_those_before(processes, words, monkeypatch, tmp_path):
+@pytest.mark.parametrize(("send", "number"), [(os.killpg, signal.SIGINT), (os.kill, signal.SIGTERM)])
+def test_an_interrupted_blind_pass_takes_nothing_from_those_before(
+    processes, words, monkeypatch, tmp_path, send, number
+):
     monkeypatch.setenv(rough_tasks.EXIT, "10001")
     monkeypatch.setenv(rough_tasks.HALT, "10002")
     out, flags = tmp_path / "report.json", ("--episodes", 4, "--jobs", 1, "--blind", "--trust", rough_tasks.MODULE)
     task = rough_tasks.name_of(rough_tasks.HaltingWithOthersSight)
     evaluation = processes.start(*words(task, *flags, "--out", out))
     evaluation.wait_for("seed 10001")
-    os.killpg(evaluation.popen.pid, signal.SIGINT)
+    send(evaluation.popen.pid, number)
     assert evaluation.finish()[0] == 130
     report = read_evaluation_report(out)
     assert (len(report.drives), len(report.hidden), report.foreign) == (4, 4, ())

@@ -108,6 +108,7 @@ def test_evaluate_plays_it_and_equal_games_have_equal_scores(agent, tmp_path, mo
         words = ["--controller", str(agent), "--episodes", "2", "--jobs", "1", "--first-seed", "11000"]
         assert main(["evaluate", *words, "--out", str(out)]) == 0
         reports.append(json.loads(out.read_text()))
+        assert main(["evaluate", *words, "--bundle", "tiny"]) == 2  # an agent has no world model
     capsys.readouterr()
     first, second = reports
     assert first["options"] == '{"environment": {"tics": 1}}'
