@@ -170,7 +170,8 @@ def latent_loss(prediction: Prediction, targets: Tensor, mask: Tensor) -> Tensor
     scaled = (targets[..., None] - prediction.means) * torch.exp(-prediction.log_deviations)
     log_normal = -0.5 * scaled.square() - prediction.log_deviations - 0.5 * math.log(2 * math.pi)
     *shape, latents, mixtures = log_normal.shape
-    together = log_normal.reshape(*shape, -1, prediction.log_weights.shape[-2], mixtures).sum(dim=-3)
+    weighted = prediction.log_weights.shape[-2]
+    together = log_normal.reshape(*shape, latents // weighted, weighted, mixtures).sum(dim=-3)
     likelihood = torch.logsumexp(prediction.log_weights + together, dim=-1).sum(dim=-1) / latents
     return -(likelihood * mask).sum() / mask.sum().clamp(min=1)
 

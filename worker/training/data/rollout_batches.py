@@ -17,7 +17,7 @@ from dreamfleet.worker.training.data.dataset import find_world, load_steps, pad,
 from dreamfleet.worker.worldmodel.mdnrnn import MDNRNN, reward_labels
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 
-CHUNK_STEPS = 10_000  # steps per chunk: about 300 MB in a model
+CHUNK_STEPS, CHUNK_ROWS = 10_000, 8  # at most in a chunk: about 300 MB in a model
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,11 @@ class Rollouts:
     mask: Tensor
 
     def chunks(self) -> Iterator[Rollouts]:
-        """Yield the same rollouts in smaller batches."""
-        rows = max(1, CHUNK_STEPS // self.mask.shape[1])
-        for start in range(0, len(self.mask), rows):
-            yield Rollouts(*(getattr(self, each.name)[start : start + rows] for each in fields(self)))
+        """Yield the same rollouts in smaller batches of about equal lengths, so that few steps are padding."""
+        lengths = self.mask.sum(dim=1).int()
+        count = max(1, min(CHUNK_ROWS, CHUNK_STEPS // self.mask.shape[1]))
+        for rows in torch.split(lengths.argsort(stable=True), count):
+            yield Rollouts(*(getattr(self, each.name)[rows, : lengths[rows].max()] for each in fields(self)))
 
     def to(self, device: torch.device | None) -> Rollouts:
         """Copy to a device."""
