@@ -14,7 +14,7 @@ from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.controller import Controller
 from dreamfleet.common.errors import UsageError
 from dreamfleet.common.runs.seeds import VALIDATION
-from dreamfleet.worker.dream.noise import BLOCK_STEPS, EpisodeNoise, stack_draws
+from dreamfleet.worker.dream.noise import BLOCK_STEPS, Draw, EpisodeNoise, stack_draws
 from dreamfleet.worker.dream.world import DreamWorld
 from dreamfleet.worker.scoring.actors import Actor
 from dreamfleet.worker.scoring.disturbance import Disturbance, DisturbedPolicy, add_disturbance
@@ -216,8 +216,12 @@ class DriveDreamer:
         z is the dreamt one, except for the first step's, which is real; h is real.
         """
         noise = EpisodeNoise(drive.seed, self._world.chance, self._world.bars)
-        pieces = [noise.draw_block() for _ in range(0, len(drive), BLOCK_STEPS)]
-        draw = stack_draws(pieces, axis=0).map(lambda part: part.reshape(-1, part.shape[-1])[: len(drive)])
-        moment = self._world.imagine(drive.latent, drive.action, drive.state, draw)
+        moment = self._world.imagine(drive.latent, drive.action, drive.state, draw_rows(noise, len(drive)))
         latent = np.concatenate([drive.latent[:1], moment.latent[:-1]])
         return join_features(latent, drive.state, self._hidden), moment.reward
+
+
+def draw_rows(noise: EpisodeNoise, rows: int) -> Draw:
+    """One step's random numbers for so many rows, which differ."""
+    pieces = [noise.draw_block() for _ in range(0, rows, BLOCK_STEPS)]
+    return stack_draws(pieces, axis=0).map(lambda part: part.reshape(-1, part.shape[-1])[:rows])

@@ -2,8 +2,8 @@
 
 import io
 from base64 import b64encode
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from html import escape
 from typing import Any
 
@@ -29,12 +29,16 @@ th { color: #5b6470; } td { font-variant-numeric: tabular-nums; overflow-wrap: a
 
 @dataclass(frozen=True)
 class Section:
-    """A section: title, explanation and perhaps a PNG `picture`; `name` is the section's id and its file's name."""
+    """A section: title, explanation and perhaps a PNG `picture`; `name` is the section's id and its file's name.
+
+    `figures` are what is drawn, by name, for JSON.
+    """
 
     name: str
     title: str
     text: str
     picture: bytes | None = None
+    figures: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -3,22 +3,24 @@
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.common.artifacts.world_facts import DRAWN, EndRule
-from dreamfleet.common.errors import MissingExtraError, UsageError
+from dreamfleet.common.errors import DatasetError, MissingExtraError, UsageError
 from dreamfleet.common.files.atomic_write import atomic_write, reporting_unwritable_folder
 from dreamfleet.common.printable import plural
 from dreamfleet.common.runs.stages import begun_stages, join_distinct
 from dreamfleet.common.runs.standard_error import format_with_error
-from dreamfleet.worker.addons.inspection import mdnrnn_sections, training_curves, vae_sections
+from dreamfleet.worker.addons.inspection import dreamt_spots, mdnrnn_sections, training_curves, vae_sections
 from dreamfleet.worker.addons.inspection.encoded_rollout import DriveConfig, EncodedRollout, record_drive
 from dreamfleet.worker.addons.inspection.page import Page, Section
 from dreamfleet.worker.addons.inspection.subject import InspectionSubject
 from dreamfleet.worker.addons.inspection.training_curves import MODELS, TrainingCurves, load_trainings
-from dreamfleet.worker.addons.inspection.vae_sections import CHECKPOINT, VAEView, held_out_drive, own_pictures
+from dreamfleet.worker.addons.inspection.vae_sections import CHECKPOINT, VAEView, held_out_drives, own_pictures
 from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.tasks.registry import task_of
 from dreamfleet.worker.training.data.dataset import find_world, world_of_folder
@@ -34,12 +36,13 @@ UNITS = {  # units of the quality figures, by a part of their names, and which v
     "brier": "mean squared error of the probability of the end: the less, the better",
     "calibration": "mean probability of the end over the share of steps that ended: 1 is right",
 }
+MODEL = "mdnrnn.safetensors"  # of a data folder
 DRIVEN = ("episodes", "frames", "held_out_episodes")  # counts in a bundle's provenance
 
 
 def write_page(
     subject: InspectionSubject, out: Path, config: DriveConfig, data: Sequence[Path] = (),
-    on_section: Callable[[int, str], None] = lambda _done, _name: None, pictures: Sequence[Path] = (),
+    on_section: Callable[[int, Section], None] = lambda _done, _section: None, pictures: Sequence[Path] = (),
 ) -> Path:  # fmt: skip
     """Write a PNG per section and the page, with the trainings in the folders `data`; return the page's path.
 
@@ -51,7 +54,7 @@ def write_page(
         trained = load_trainings(data)
         for section in sections_of(subject, config, data, pictures, trained):
             sections.append(section)
-            on_section(len(sections), section.name)
+            on_section(len(sections), section)
             if section.picture is not None:
                 with atomic_write(out / f"{section.name}.png") as file:
                     file.write(section.picture)
@@ -121,7 +124,7 @@ def _vae_sections(data: Sequence[Path], config: DriveConfig) -> Iterator[Section
         except MissingExtraError as error:
             yield Section("reconstructions", "What it sees, and what it keeps", f"Not shown: {error}")
             return
-        driven = held_out_drive(folder, vae_view, config)
+        driven = next(held_out_drives(folder, vae_view, config))
         section = vae_sections.reconstructions(driven, vae_view)
         if len(folders) > 1:
             yield replace(section, name=f"{section.name}-{number}", title=f"{section.title}: {folder.resolve().name}")
@@ -129,6 +132,19 @@ def _vae_sections(data: Sequence[Path], config: DriveConfig) -> Iterator[Section
         yield section
         yield vae_sections.spots(driven, vae_view)
         yield from _latent_sections(driven, vae_view)
+        if (folder / MODEL).exists() and (dreamt := _dreamt_spots_of_folder(folder, vae_view, config)):
+            yield dreamt
+
+
+def _dreamt_spots_of_folder(folder: Path, vae_view: VAEView, config: DriveConfig) -> Section | None:
+    from dreamfleet.worker.training.assemble import assemble
+
+    with TemporaryDirectory() as aside:
+        try:
+            bundle = assemble(folder, Path(aside) / "data.zip", "data", with_weights=False)
+        except DatasetError as error:
+            return Section(dreamt_spots.NAME, dreamt_spots.TITLE, f"Not shown: {error}")
+        return dreamt_spots.dreamt_spots_section(bundle, held_out_drives(folder, vae_view, config))
 
 
 def _bundle_sections(bundle: Bundle, subject: InspectionSubject, config: DriveConfig) -> Iterator[Section]:
@@ -137,6 +153,8 @@ def _bundle_sections(bundle: Bundle, subject: InspectionSubject, config: DriveCo
     yield vae_sections.spots(driven, vae_view)
     yield from _latent_sections(driven, vae_view)
     yield mdnrnn_sections.dream_section(bundle, driven, vae_view)
+    if dreamt := dreamt_spots.dreamt_spots_section(bundle, _drives(bundle, subject, config, driven)):
+        yield dreamt
     heads = bundle.manifest.models.get("mdnrnn", {})
     if heads.get("reward", "none") != "none":
         yield mdnrnn_sections.reward_section(bundle, driven)
@@ -144,6 +162,15 @@ def _bundle_sections(bundle: Bundle, subject: InspectionSubject, config: DriveCo
         yield mdnrnn_sections.ends_section(bundle, driven)
     if looked := mdnrnn_sections.attention_section(bundle, driven):
         yield looked
+
+
+def _drives(
+    bundle: Bundle, subject: InspectionSubject, config: DriveConfig, first: EncodedRollout
+) -> Iterator[EncodedRollout]:
+    """The page's drive, and after it those of the seeds that follow, unless they are too short for a dream."""
+    yield first
+    for seed in count(config.seed + 1) if config.steps > dreamt_spots.AHEAD[-1] else ():
+        yield record_drive(bundle, subject.controller, replace(config, seed=seed), subject.own)
 
 
 def _latent_sections(driven: EncodedRollout, vae_view: VAEView) -> Iterator[Section]:

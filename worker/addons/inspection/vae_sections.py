@@ -1,6 +1,6 @@
 """A VAE of a bundle or a data folder: its reconstructions of a drive and of own pictures, and what its latents mean."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -78,17 +78,19 @@ class VAEView:
         return cls(config.picture, config.latent, encode, decode)
 
 
-def held_out_drive(folder: Path, vae_view: VAEView, config: DriveConfig) -> EncodedRollout:
-    """Load the first held-out drive of a data set, `config.steps` steps at most."""
+def held_out_drives(folder: Path, vae_view: VAEView, config: DriveConfig) -> Iterator[EncodedRollout]:
+    """Load the held-out drives of a data set one by one, `config.steps` steps at most of each."""
     from dreamfleet.worker.training.data import dataset
 
-    _, (path, *_) = dataset.split_held_out(dataset.episode_paths(folder))
-    dataset.check_pictures([path], vae_view.side)
-    seen, steps = dataset.load_pictures(path)[: config.steps], dataset.load_steps(path)
-    mu, logvar = vae_view.encode(seen)
-    action, reward = (steps[name][: len(seen)] for name in ("action", "reward"))
-    about, world = f"drive {path.stem}, which is held out", dataset.find_world(*dataset.world_of_folder(folder)).world
-    return EncodedRollout(seen, mu, logvar, action, reward.astype(np.float64), about, world.opening)
+    _, paths = dataset.split_held_out(dataset.episode_paths(folder))
+    world = dataset.find_world(*dataset.world_of_folder(folder)).world
+    for path in paths:
+        dataset.check_pictures([path], vae_view.side)
+        seen, steps = dataset.load_pictures(path)[: config.steps], dataset.load_steps(path)
+        mu, logvar = vae_view.encode(seen)
+        action, reward = (steps[name][: len(seen)] for name in ("action", "reward"))
+        about = f"drive {path.stem}, which is held out"
+        yield EncodedRollout(seen, mu, logvar, action, reward.astype(np.float64), about, world.opening)
 
 
 def reconstructions(drive: EncodedRollout, vae_view: VAEView) -> Section:

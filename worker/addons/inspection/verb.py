@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from dreamfleet.common.cli.global_config import add_global_flags
 from dreamfleet.common.cli.output import add_json_flag, print_answer, print_rows
@@ -27,13 +27,14 @@ from dreamfleet.worker.addons.inspection.measure import (
 )
 
 if TYPE_CHECKING:
+    from dreamfleet.worker.addons.inspection.page import Section
     from dreamfleet.worker.addons.inspection.subject import InspectionSubject
 
 SUMMARY = "look into a world model: what it sees, keeps and dreams, and how it learnt, as one page, or as figures"
 EXTRAS = ("worker", "views")
 FIRST = "--out --data --picture --controller --seed --steps --probe --losses --likeness --survival --episodes --json"
 WORDS = ("quantity", "begun", "mean", "policy")  # columns of the figures that are no numbers
-SECTIONS = 13  # at most, and one more a data folder
+SECTIONS = 14  # at most, and one more a data folder
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -124,10 +125,16 @@ def _draw_page(args: argparse.Namespace) -> int:
             raise UsageError("--action is driven beside a world model's dream: name a bundle, or a run with one")
         sections = SECTIONS + len(args.data)
         config = DriveConfig(args.seed, args.steps, tuple(args.action or ()))
+        figures = dict[str, Any]()
         with progress_bar("inspect", sections, "sections") as bar:
-            page = write_page(subject, args.out, config, args.data, bar.update, args.picture)
+
+            def on_section(done: int, section: Section) -> None:
+                bar.update(done, section.name)
+                figures.update(section.figures)
+
+            page = write_page(subject, args.out, config, args.data, on_section, args.picture)
             bar.update(sections)
-    print_answer(args, str(page), page=page)
+    print_answer(args, str(page), page=page, **figures)
     return 0
 
 

@@ -24,6 +24,7 @@ from dreamfleet.coordinator.jobs.evaluation import Evaluation
 from dreamfleet.coordinator.jobs.scoring_job import vector_bytes
 from dreamfleet.coordinator.storage.journal import Journal
 from dreamfleet.worker.addons.inspection import (
+    dreamt_spots,
     encoded_rollout,
     mdnrnn_sections,
     measurements,
@@ -45,7 +46,7 @@ from dreamfleet.worker.addons.inspection.survival import (
     measure_survival,
 )
 from dreamfleet.worker.addons.inspection.training_curves import UNITS, load_trainings, merge_points
-from dreamfleet.worker.addons.inspection.vae_sections import VAEView, fit_picture, held_out_drive
+from dreamfleet.worker.addons.inspection.vae_sections import VAEView, fit_picture, held_out_drives
 from dreamfleet.worker.tasks.api import World
 from dreamfleet.worker.training.data.dataset import find_world, preprocessing_of_size
 from dreamfleet.worker.training.presets import TrainConfig
@@ -53,7 +54,7 @@ from dreamfleet.worker.worldmodel.inference import DreamStep
 from dreamfleet.worker.worldmodel.mdnrnn_config import MDNRNNConfig
 from dreamfleet.worker.worldmodel.vae_config import VAEConfig
 from tests.support.bundles import write_random_bundle, write_world_bundle
-from tests.support.drives import train_models, write_drives
+from tests.support.drives import linked, train_models, write_drives
 from tests.support.models import random_models
 from tests.support.pixel_world import Dodge, DodgeTask
 from tests.support.samples import SPEC
@@ -66,6 +67,7 @@ VAE = VAEConfig(latent=5, channels=(4, 4, 4, 8))
 ATTENTIVE = MDNRNNConfig(latent=5, hidden=8, mixtures=2, window=3, attention_units=4)
 SHORT = DriveConfig(steps=12)
 LOOKS = ["reconstructions", "spots", "traversals", "latents", "samples"]
+DREAMS = ["dream", "dreamt-spots"]
 
 
 class Links(HTMLParser):
@@ -102,9 +104,11 @@ def test_a_page_has_every_section_and_needs_nothing_else(attentive, tmp_path):
         points = [{"update": update, **dict.fromkeys(parts, 100.0 / update)} for update in range(1, 60)]
         (tmp_path / f"{name}.jsonl").write_text("\n".join(json.dumps(point) for point in points))
     sections, subject = [], InspectionSubject(attentive)
-    page = write_page(subject, tmp_path / "out", SHORT, [tmp_path], lambda *done: sections.append(done))
+    page = write_page(
+        subject, tmp_path / "out", SHORT, [tmp_path], lambda done, section: sections.append((done, section.name))
+    )
     found = Links(page.read_text())
-    names = [*LOOKS, "dream", "rewards", "attention", "loss-vae", "loss-mdnrnn"]
+    names = [*LOOKS, *DREAMS, "rewards", "attention", "loss-vae", "loss-mdnrnn"]
     assert found.sections == names
     assert sections == list(enumerate(names, 1))
     assert all(address.startswith("data:image/png;base64,") for address in found.addresses)
@@ -133,7 +137,7 @@ def test_what_a_bundle_cannot_do_is_left_out_and_a_drive_is_seen_as_it_sees(tmp_
     rnn = MDNRNNConfig(latent=5, hidden=8, reward="none")
     plain = write_random_bundle(tmp_path / "plain.zip", vae=whole, rnn=rnn)
     page = write_page(InspectionSubject(plain), tmp_path / "plain", SHORT)
-    assert Links(page.read_text()).sections == [*LOOKS, "dream"]
+    assert Links(page.read_text()).sections == [*LOOKS, *DREAMS]
     assert record_drive(plain, None, SHORT).picture.shape == (12, 96, 96, 3)
 
 
@@ -327,8 +331,19 @@ def test_a_vae_alone_shows_what_it_keeps_of_a_held_out_drive_beside_how_it_learn
     page = page_of([trained], tmp_path)
     assert sections(page) == ["reconstructions", "spots", "traversals", "latents", "samples", "loss-vae", "loss-mdnrnn"]
     assert "00000" in page.read_text()
-    drive = held_out_drive(trained, VAEView.of_folder(trained), DriveConfig(steps=8))
+    drive = next(held_out_drives(trained, VAEView.of_folder(trained), DriveConfig(steps=8)))
     assert len(drive) == len(drive.mu) == 8
+
+
+@pytest.mark.slow
+def test_a_folders_mdnrnn_dreams_on_from_held_out_drives_and_a_damaged_one_spoils_no_page(trained, tmp_path):
+    whole = linked(trained, tmp_path / "whole", "episodes", "encoded", "vae.safetensors", "vae.jsonl")
+    assert sections(page_of([trained], tmp_path, steps=12)) == [*LOOKS, "dreamt-spots", "loss-vae", "loss-mdnrnn"]
+    assert (tmp_path / "dreamt-spots.png").read_bytes().startswith(PNG)
+    (whole / "mdnrnn.safetensors").write_bytes(b"damaged")
+    page = page_of([whole], tmp_path / "page", steps=12)
+    assert sections(page) == [*LOOKS, "dreamt-spots", "loss-vae"]
+    assert not (page.parent / "dreamt-spots.png").exists()
 
 
 @pytest.mark.slow
@@ -585,7 +600,7 @@ def test_a_page_shows_a_world_of_choices(dodge, tmp_path, closed):
     assert not (page.parent / "rewards.png").exists(), "it predicts none"
     assert "CarRacing" not in page.read_text()
     assert dict(manifest_facts(dodge))["task"] == DodgeTask.name
-    assert len(closed) == 1
+    assert len(closed) == dreamt_spots.MOST_DRIVES
 
 
 def test_the_pages_drive_can_be_one_choice_by_its_number(dodge):
