@@ -42,8 +42,7 @@ def find_spots(pictures: Pictures, decoded: NDArray[Any], mean: Floats, deviatio
 
     `mean` and `deviation` are those of `measure_mean`.
     """
-    batches = zip(_in_batches(pictures), _in_batches(decoded), strict=True)
-    found = [_find_in(seen - mean, shown - mean, deviation) for seen, shown in batches]
+    found = [_find_in(*each, mean, deviation) for each in zip(_in_batches(pictures), _in_batches(decoded), strict=True)]
     return Spots(*map(np.concatenate, zip(*found, strict=True)))
 
 
@@ -51,20 +50,15 @@ def _in_batches(pictures: NDArray[Any]) -> list[NDArray[Any]]:
     return [pictures[start : start + BATCH] for start in range(0, max(1, len(pictures)), BATCH)]
 
 
-def _find_in(seen: Floats, shown: Floats, deviation: float) -> Spots:
-    """The spots of a batch, given as differences from the mean picture."""
-    labels = _label(np.abs(seen).mean(axis=3) > DEVIATIONS * deviation)
-    flat = labels.ravel()
-    found, index = np.unique(flat[flat > 0], return_inverse=True)
-    size = np.bincount(index, minlength=len(found))
-    rows, columns = np.divmod(np.flatnonzero(flat) % labels[0].size, labels.shape[2])
-
-    def total(values: Floats) -> Floats:
-        return np.bincount(index, values, len(found)).astype(np.float64)
-
-    whole, share = (total(each.sum(axis=3).ravel()[flat > 0]) for each in (seen**2, seen * shown))
-    side = labels.shape[1]
-    return Spots(size, total(rows + 0.5) / size / side, total(columns + 0.5) / size / side, share >= KEPT * whole)
+def _find_in(pictures: Pictures, decoded: NDArray[Any], mean: Floats, deviation: float) -> Spots:
+    away = pictures - mean
+    mask = np.abs(away).mean(axis=3) > DEVIATIONS * deviation
+    found, index, size = np.unique(_label(mask), return_inverse=True, return_counts=True)
+    _, rows, columns = np.nonzero(mask)
+    seen, shown = away[mask], decoded[mask] - mean[rows, columns]
+    weights = (seen**2).sum(axis=1), (seen * shown).sum(axis=1), rows + 0.5, columns + 0.5
+    whole, share, row, column = (np.bincount(index, each, len(found)).astype(np.float64) for each in weights)
+    return Spots(size, row / size / len(mean), column / size / len(mean), share >= KEPT * whole)
 
 
 def kept_shares(spots: Spots) -> dict[str, float]:
@@ -74,13 +68,15 @@ def kept_shares(spots: Spots) -> dict[str, float]:
 
 
 def _label(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """A number for each connected part of each picture's `mask` `(N, side, side)`, unique over all; 0: none."""
-    labels = np.where(mask, np.arange(mask.size).reshape(mask.shape), -1)  # a pixel's label is a pixel of its part
-    while True:
+    """For each pixel of `mask` `(N, side, side)`, in order, the last pixel of its connected part, by its number."""
+    number = np.cumsum(mask).reshape(mask.shape) - 1
+    neighbours = ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[:, :, 1:], np.s_[:, :, :-1]))
+    pairs = [np.stack([number[one], number[other]])[:, mask[one] & mask[other]] for one, other in neighbours]
+    one, other = np.concatenate(pairs, axis=1)
+    labels, before = np.arange(np.count_nonzero(mask)), np.arange(0)  # a pixel's label is a pixel of its part
+    while not np.array_equal(labels, before):
         before = labels.copy()
-        for one, other in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[:, :, 1:], np.s_[:, :, :-1])):
-            for into, of in ((one, other), (other, one)):
-                np.maximum(labels[into], labels[of], out=labels[into], where=mask[into])
-        labels[mask] = labels.ravel()[labels[mask]]  # the label's own label: few turns, though more for a spiral
-        if np.array_equal(labels, before):
-            return labels + 1
+        np.maximum.at(labels, one, before[other])
+        np.maximum.at(labels, other, before[one])
+        labels = labels[labels]  # the label's own label: few turns, though more for a spiral
+    return labels
