@@ -105,7 +105,9 @@ def _dream(
         for ahead in range(1, min(max(DREAM_STEPS), length - 1 - start) + 1):
             hidden, state = model.advance(torch.cat([latent, rollouts.action[:, start + ahead - 1]], dim=1), state)
             predicted = model.predict(hidden)
-            latent = (predicted.log_weights.exp() * predicted.means).sum(dim=-1)
+            weights = predicted.log_weights.exp()
+            weights = weights.repeat(1, model.config.latent // model.config.weighted, 1)
+            latent = (weights * predicted.means).sum(dim=-1)
             if config.previous_reward:
                 state = with_reward_label(
                     model, state, predicted.reward if config.reward == "value" else (predicted.reward > 0).float()

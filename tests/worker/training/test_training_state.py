@@ -371,6 +371,12 @@ def test_every_presets_layers_train_and_foresee(encoded, name):
     assert any(name in figures for name in ("reward_auc", "reward_rmse")) == layers.has_reward_head
 
 
+@pytest.mark.parametrize("columns", [0, 2])
+def test_a_model_with_joint_mixtures_trains_and_foresees(encoded, columns):
+    layers = MDNRNNConfig(latent=4, hidden=8, joint=True, columns=columns)
+    assert "nats_per_dimension" in train_mdnrnn.train_mdnrnn(encoded, SHORT, ignore, layers)
+
+
 def test_a_batch_in_chunks_has_the_same_gradients(drives, monkeypatch):
     model = MDNRNN(replace(RNN, dropout=0.0, done=True))
     rollouts = load_rollouts(sorted((drives / "encoded").glob("*.npz")))
