@@ -98,7 +98,7 @@ def random_rnn_weights(seed=0, rnn=REWARDED):
         channels, others = 64, rnn.inputs - rnn.latent + rnn.hidden - rnn.units_in_columns
         seen, outputs = rnn.columns + rnn.column_units, sum(rnn.rows) * rnn.mixtures // rnn.side
         weights.add_layer("heads.near", (channels, seen, 5), seen * 5, channels)
-        weights.draw("heads.everywhere.weight", (channels, others), others)
+        weights.add_dense("heads.everywhere", others, channels * rnn.side)
         weights.add_layer("heads.second", (channels, channels, 3), channels * 3, channels)
         weights.add_layer("heads.mixtures", (outputs, channels, 1), channels, outputs)
         if rnn.has_reward_head or rnn.done:

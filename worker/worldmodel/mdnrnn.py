@@ -143,7 +143,7 @@ class ColumnHeads(nn.Module):
         self._config = config
         everywhere = config.inputs - config.latent + config.hidden - config.units_in_columns
         self.near = nn.Conv1d(config.columns + config.column_units, HEAD_CHANNELS, 5, padding=2)
-        self.everywhere = nn.Linear(everywhere, HEAD_CHANNELS, bias=False)
+        self.everywhere = nn.Linear(everywhere, HEAD_CHANNELS * config.side)  # things move apart as they come near
         self.second = nn.Conv1d(HEAD_CHANNELS, HEAD_CHANNELS, 3, padding=1)
         self.mixtures = nn.Conv1d(HEAD_CHANNELS, sum(config.rows) * config.mixtures // config.side, 1)
         if config.has_reward_head or config.done:
@@ -156,7 +156,7 @@ class ColumnHeads(nn.Module):
         latents, seen, units, rest = features.reshape(-1, features.shape[-1]).tensor_split(ends, dim=1)
         near = [latents.reshape(-1, config.columns, side), units.reshape(-1, config.column_units, side)]
         everywhere = self.everywhere(torch.cat([seen, rest], dim=1))
-        value = torch.relu(self.near(torch.cat(near, dim=1)) + everywhere[..., None])
+        value = torch.relu(self.near(torch.cat(near, dim=1)) + everywhere.reshape(-1, HEAD_CHANNELS, side))
         value = torch.relu(self.second(value))
         parts = self.mixtures(value).flatten(1).split([config.mixtures * count for count in config.rows], dim=1)
         out = [each.reshape(len(each), config.mixtures, -1).transpose(1, 2).flatten(1) for each in parts]

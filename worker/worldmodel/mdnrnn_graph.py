@@ -168,8 +168,10 @@ def _column_heads(
     parts = ((latent, config.columns), (units, config.column_units))
     seen = graph.join(*(graph.node("Reshape", each, graph.shape(-1, count, config.side)) for each, count in parts))
     near = convolve(seen, "near", 2)
-    everywhere = graph.linear(graph.join(others, rest), rnn["heads.everywhere.weight"].T)
-    value = graph.node("Relu", graph.node("Add", near, graph.node("Unsqueeze", everywhere, graph.shape(2))))
+    kernel, bias = rnn["heads.everywhere.weight"].T, rnn["heads.everywhere.bias"]
+    everywhere = graph.linear(graph.join(others, rest), kernel, bias)
+    placed = graph.node("Reshape", everywhere, graph.shape(-1, len(bias) // config.side, config.side))
+    value = graph.node("Relu", graph.node("Add", near, placed))
     value = graph.node("Relu", convolve(value, "second", 1))
     size = config.mixtures * sum(config.rows)
     mixtures = graph.node("Reshape", convolve(value, "mixtures", 0), graph.shape(-1, size))

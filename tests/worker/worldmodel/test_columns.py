@@ -65,7 +65,7 @@ def test_what_lies_a_column_beside_another_moves_units_and_predictions_by_a_colu
     assert units == 48
     with torch.no_grad():
         model.lstm.bias_ih_l0.zero_()
-        for layer in (model.heads.near, model.heads.second, model.heads.mixtures):
+        for layer in (model.heads.near, model.heads.everywhere, model.heads.second, model.heads.mixtures):
             layer.bias.zero_()
         candidates = 2 * config.hidden
         model.lstm.weight_ih_l0[candidates + units : candidates + config.hidden] = 0  # others stay 0

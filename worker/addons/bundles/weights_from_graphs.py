@@ -64,7 +64,7 @@ def mdnrnn_weights(dream: bytes, config: MDNRNNConfig) -> Weights:
 
 
 def _column_heads(constants: Iterator[NDArray[np.float32]], config: MDNRNNConfig) -> Weights:
-    found = _pair("heads.near", constants) | {"heads.everywhere.weight": _next(constants).T}
+    found = _pair("heads.near", constants) | _pair("heads.everywhere", constants, transposed=True)
     found |= _pair("heads.second", constants) | _pair("heads.mixtures", constants)
     if config.has_reward_head or config.done:
         found |= _pair("heads.others", constants, transposed=True)
