@@ -8,6 +8,7 @@
 
 #include "body.h"
 #include "canvas.h"
+#include "game.h"
 
 #include <math.h>
 #include <string.h>
@@ -366,5 +367,12 @@ PyMODINIT_FUNC PyInit__native(void)
     canvas_init(&canvas);
     if (!roll_init() || !body_init())
         return NULL;
-    return PyModule_Create(&definition);
+    PyObject *module = PyModule_Create(&definition), *race = module ? game_type() : NULL;
+    if (race && PyModule_AddObjectRef(module, "Race", race) == 0) {
+        Py_DECREF(race);
+        return module;
+    }
+    Py_XDECREF(race);
+    Py_XDECREF(module);
+    return NULL;
 }
