@@ -10,6 +10,7 @@ import argparse
 import math
 import struct
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -112,14 +113,16 @@ def compare_state(step: int, environment: Any, race: Any, tiles: bool) -> Differ
     return None
 
 
-def race_against(environment: Any, race: Any, seed: int, drive: Driver, steps: int) -> tuple[int, Difference | None]:
-    """One episode: steps driven, and the first difference."""
+def race_against(
+    environment: Any, race: Any, seed: int, drive: Driver, steps: int, counts: Counter[str], beyond: bool = False
+) -> Difference | None:
+    """One episode, or with `beyond` all the steps, whatever it says of its end; the first difference."""
     environment.reset(seed=seed)
     start(race, environment)
     difference = compare_state(0, environment, race, tiles=True)
     for step in range(1, steps + 1):
         if difference:
-            return step, difference
+            break
         action = drive(step)
         _, reward, over, _, info = environment.step(np.array(action, np.float64))
         ours = race.step(*action)
@@ -127,9 +130,13 @@ def race_against(environment: Any, race: Any, seed: int, drive: Driver, steps: i
         difference = compare_state(step, environment, race, tiles=over or step % 10 == 0)
         if bits(told[0]) != bits(ours[0]) or told[1] is not ours[1]:
             difference = Difference(step, "reward and end", told, ours)
-        if over:
-            return step, difference
-    return steps, difference
+        counts["steps"] += 1
+        counts["steps asleep"] += not race.body(HULL)[-1]
+        if over and not beyond:
+            break
+    counts["laps"] += environment.new_lap or environment.tile_visited_count == len(environment.track)
+    counts["fields left"] += max(map(abs, environment.car.hull.position)) > car_racing.PLAYFIELD
+    return difference
 
 
 # ---- manners of driving ----
@@ -164,6 +171,12 @@ def at_rest(environment: Any, random: np.random.Generator) -> Driver:
     return lambda step: (random.uniform(-1, 1), 0.5, 0.0) if step % 900 < 20 else (0.0, 0.0, float(step % 900 > 300))
 
 
+def extreme(environment: Any, random: np.random.Generator) -> Driver:
+    """Numbers that no action space has."""
+    sizes = [0.0, -0.0, 1.0, 3.0, 1e3, 1e30]
+    return lambda step: tuple(random.choice([-1, 1], 3) * random.choice(sizes, 3))
+
+
 def still(environment: Any, random: np.random.Generator) -> Driver:
     """Nothing at all."""
     return lambda _: (0.0, 0.0, 0.0)
@@ -186,37 +199,32 @@ def follow(environment: Any, random: np.random.Generator) -> Driver:
     return drive
 
 
-MANNERS = {"follow": follow, "wild": wild, "held": held, "away": away, "at rest": at_rest, "still": still}
+MANNERS = {"follow": follow, "wild": wild, "held": held, "away": away, "at rest": at_rest, "extreme": extreme, "still": still}
 LONGEST = {"follow": 3000, "at rest": 3000, "still": 300, "away": 1500}
+BEYOND = ("away", "extreme", "follow")  # every other one of these drives on after its end
 
 
-def compare(steps: int, seed: int = 1, fresh_every: int = 7) -> tuple[dict[str, int], Difference | None]:
-    """Alternate tracks and manners for so many steps: steps, laps and fields left, and the first difference.
+def compare(steps: int, seed: int = 1, fresh_every: int = 9) -> tuple[Counter[str], Difference | None]:
+    """Alternate tracks and manners for so many steps: what happened, and the first difference.
 
     An environment lives for `fresh_every` episodes, for gymnasium's world keeps traces of those before.
     """
-    counts = {"steps": 0, "episodes": 0, "laps": 0, "left": 0, "slept": 0}
-    episode = 0
+    counts: Counter[str] = Counter()
+    difference = None
     environment: Any = None
     race: Any = None
-    while counts["steps"] < steps:
+    while counts["steps"] < steps and difference is None:
+        episode = counts["episodes"]
         if episode % fresh_every == 0:
             environment, race = Blind(lap_complete_percent=(0.95, 0.3)[episode % 2]), _native.Race()
         name = list(MANNERS)[episode % len(MANNERS)]
-        random = np.random.default_rng(seed + episode)
-        driver = MANNERS[name](environment, random)
-        most = LONGEST.get(name, 1000)
-        done, difference = race_against(environment, race, seed + episode, driver, most)
-        counts["steps"] += done
-        counts["episodes"] += 1
-        counts["laps"] += environment.new_lap or environment.tile_visited_count == len(environment.track)
-        counts["left"] += max(map(abs, environment.car.hull.position)) > car_racing.PLAYFIELD
-        counts["slept"] += not environment.car.hull.awake
+        drive = MANNERS[name](environment, np.random.default_rng(seed + episode))
+        beyond = name in BEYOND and episode // len(MANNERS) % 2 == 1
+        difference = race_against(environment, race, seed + episode, drive, LONGEST.get(name, 1000), counts, beyond)
         if difference:
             print(f"{name}, seed {seed + episode}, episode {episode % fresh_every} of its environment")
-            return counts, difference
-        episode += 1
-    return counts, None
+        counts["episodes"] += 1
+    return counts, difference
 
 
 def time_both(steps: int, seed: int = 5, block: int = 50) -> tuple[float, float]:
@@ -252,7 +260,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
     counts, difference = compare(arguments.steps, arguments.seed)
-    print(counts, difference)
+    print(dict(counts), difference)
     print("Box2D {:.1f} us a step, native {:.1f}".format(*time_both(5_000)))
     raise SystemExit(difference is not None)
 

@@ -122,25 +122,17 @@ static void find_contacts(Race *race, unsigned moved)
     }
 }
 
-/* Where a body was before the step, as its centre of mass tells; a new body's origin tells it otherwise. */
-static Pose pose_before(const Rigid *body)
-{
-    Turn turn = turn_by(body->angle_before);
-    return (Pose){vec_sub(body->at_before, turn_out(turn, body->centre)), turn};
-}
-
 void contact_follow(Race *race)
 {
     unsigned moved = 0;
     for (int mover = MOVERS - 1; mover >= 0; mover--) { /* the newest first */
         const Rigid *body = mover_body(race, mover);
         const Fixture *fixture = mover_fixture(race, mover);
-        Pose before = pose_before(body);
         Vec world[CORNERS];
-        polygon_place(&fixture->polygon, before, world);
+        polygon_place(&fixture->polygon, body->before, world);
         Box box = polygon_box(world, fixture->polygon.count);
         box = box_join(box, polygon_box(fixture->world, fixture->polygon.count));
-        if (tree_move(&race->tree, fixture->leaf, box, vec_sub(body->pose.at, before.at)))
+        if (tree_move(&race->tree, fixture->leaf, box, vec_sub(body->pose.at, body->before.at)))
             moved |= 1u << mover;
     }
     find_contacts(race, moved);

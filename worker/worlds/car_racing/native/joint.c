@@ -9,11 +9,12 @@
 #define PI 3.14159265359f
 static const float LOWER = -0.4f, UPPER = 0.4f;
 static const float TORQUE = (float)(180 * 900 * 0.02 * 0.02);
+static const float NOTHING = -0.0f; /* which changes no sum: 0.0f would change -0.0f */
 static const float SLOP = 0.005f, ANGLE_SLOP = 2.0f / 180.0f * PI, MOST_TURN = 8.0f / 180.0f * PI;
 
 float joint_angle(const Joint *joint, const Rigid *bodies)
 {
-    return bodies[joint->wheel].angle - bodies[joint->hull].angle - 0.0f;
+    return bodies[joint->wheel].angle - bodies[joint->hull].angle;
 }
 
 void joint_drive(Joint *joint, Rigid *bodies, float speed)
@@ -23,13 +24,13 @@ void joint_drive(Joint *joint, Rigid *bodies, float speed)
     joint->speed = speed;
 }
 
-/* Both bodies receive the impulse, the hull the other way. */
-static void push(const Joint *joint, Motion *motions, Vec pin, float turn)
+/* Both bodies receive an impulse, the hull the other way. */
+static void push(const Joint *joint, Motion *hull, Motion *wheel, Impulse impulse)
 {
-    Motion *hull = &motions[joint->hull], *wheel = &motions[joint->wheel];
-    hull->velocity = vec_sub(hull->velocity, vec_scale(joint->hull_by_mass, pin));
-    hull->spin -= joint->hull_by_inertia * turn;
-    wheel->velocity = vec_add(wheel->velocity, vec_scale(joint->wheel_by_mass, pin));
+    hull->velocity = vec_sub(hull->velocity, vec_scale(joint->hull_by_mass, impulse.pin));
+    hull->spin -= joint->hull_by_inertia * (vec_cross(joint->hull_arm, impulse.pin) + impulse.motor + impulse.limit);
+    wheel->velocity = vec_add(wheel->velocity, vec_scale(joint->wheel_by_mass, impulse.pin));
+    wheel->spin += joint->wheel_by_inertia * (vec_cross(joint->wheel_arm, impulse.pin) + impulse.motor + impulse.limit);
 }
 
 static Vec pin_arm(const Joint *joint, const Rigid *bodies, bool wheel, Turn turn)
@@ -77,14 +78,11 @@ void joint_begin(Joint *joint, const Rigid *bodies, Impulse *impulse, Motion *mo
     impulse->pin = vec_scale(ratio, impulse->pin);
     impulse->limit *= ratio;
     impulse->motor *= ratio;
-    push(joint, motions, impulse->pin, vec_cross(joint->hull_arm, impulse->pin) + impulse->motor + impulse->limit);
-    motions[joint->wheel].spin += joint->wheel_by_inertia *
-                                  (vec_cross(joint->wheel_arm, impulse->pin) + impulse->motor + impulse->limit);
+    push(joint, &motions[joint->hull], &motions[joint->wheel], *impulse);
 }
 
-static void drive(const Joint *joint, Impulse *impulse, Motion *motions, float dt)
+static void drive(const Joint *joint, Impulse *impulse, Motion *hull, Motion *wheel, float dt)
 {
-    Motion *hull = &motions[joint->hull], *wheel = &motions[joint->wheel];
     float most = dt * TORQUE, before = impulse->motor;
     float wanted = -joint->motor_mass * (wheel->spin - hull->spin - joint->speed);
     impulse->motor = clamp(before + wanted, -most, most);
@@ -94,12 +92,11 @@ static void drive(const Joint *joint, Impulse *impulse, Motion *motions, float d
 }
 
 /* How the two ends of the pin move apart. */
-static Vec drift(const Joint *joint, const Motion *motions)
+static Vec drift(const Joint *joint, const Motion *hull, const Motion *wheel)
 {
-    Motion hull = motions[joint->hull], wheel = motions[joint->wheel];
     Vec a = joint->hull_arm, b = joint->wheel_arm;
-    return (Vec){wheel.velocity.x - wheel.spin * b.y - hull.velocity.x + hull.spin * a.y,
-                 wheel.velocity.y + wheel.spin * b.x - hull.velocity.y - hull.spin * a.x};
+    return (Vec){wheel->velocity.x - wheel->spin * b.y - hull->velocity.x + hull->spin * a.y,
+                 wheel->velocity.y + wheel->spin * b.x - hull->velocity.y - hull->spin * a.x};
 }
 
 /* The pin's impulse against a drift, if only the pin pushes. */
@@ -110,10 +107,10 @@ static Vec solve_flat(const Joint *joint, Vec drift)
 }
 
 /* At a limit pin and limit push together, unless the limit would have to pull: then it lets go. */
-static void hold_limit(const Joint *joint, Impulse *impulse, Motion *motions)
+static void hold_limit(const Joint *joint, Impulse *impulse, Motion *hull, Motion *wheel)
 {
-    Vec apart = drift(joint, motions);
-    float turn = motions[joint->wheel].spin - motions[joint->hull].spin;
+    Vec apart = drift(joint, hull, wheel);
+    float turn = wheel->spin - hull->spin;
     float xx = joint->xx, xy = joint->xy, xt = joint->xt, yy = joint->yy, yt = joint->yt, tt = joint->tt;
     float x = apart.x * (yy * tt - yt * yt) + apart.y * (yt * xt - xy * tt) + turn * (xy * yt - yy * xt);
     float y = xx * (apart.y * tt - turn * yt) + xy * (turn * xt - apart.x * tt) + xt * (apart.x * yt - apart.y * xt);
@@ -129,21 +126,27 @@ static void hold_limit(const Joint *joint, Impulse *impulse, Motion *motions)
         impulse->limit = sum;
     }
     impulse->pin = vec_add(impulse->pin, pin);
-    push(joint, motions, pin, vec_cross(joint->hull_arm, pin) + stop);
-    motions[joint->wheel].spin += joint->wheel_by_inertia * (vec_cross(joint->wheel_arm, pin) + stop);
+    push(joint, hull, wheel, (Impulse){pin, stop, NOTHING});
 }
 
-void joint_hold(const Joint *joint, Impulse *impulse, Motion *motions, float dt)
+static void hold(const Joint *joint, Impulse *impulse, Motion *hull, Motion *wheel, float dt)
 {
-    drive(joint, impulse, motions, dt);
+    drive(joint, impulse, hull, wheel, dt);
     if (joint->limit != BETWEEN) {
-        hold_limit(joint, impulse, motions);
+        hold_limit(joint, impulse, hull, wheel);
         return;
     }
-    Vec apart = drift(joint, motions), pin = solve_flat(joint, (Vec){-apart.x, -apart.y});
+    Vec apart = drift(joint, hull, wheel), pin = solve_flat(joint, (Vec){-apart.x, -apart.y});
     impulse->pin = vec_add(impulse->pin, pin);
-    push(joint, motions, pin, vec_cross(joint->hull_arm, pin));
-    motions[joint->wheel].spin += joint->wheel_by_inertia * vec_cross(joint->wheel_arm, pin);
+    push(joint, hull, wheel, (Impulse){pin, NOTHING, NOTHING});
+}
+
+void joints_hold(const Joint *joints, int count, Impulse *impulses, Motion *motions, float dt)
+{
+    Motion hull = motions[joints->hull]; /* in registers */
+    for (int i = count - 1; i >= 0; i--)
+        hold(&joints[i], &impulses[i], &hull, &motions[joints[i].wheel], dt);
+    motions[joints->hull] = hull;
 }
 
 /* Turns both bodies back to the limit; how far they were beyond it. */
@@ -151,7 +154,7 @@ static float mend_limit(const Joint *joint, Place *hull, Place *wheel)
 {
     if (joint->limit == BETWEEN)
         return 0;
-    float angle = wheel->angle - hull->angle - 0.0f, error, back;
+    float angle = wheel->angle - hull->angle, error, back;
     if (joint->limit == LOWEST) {
         error = -(angle - LOWER);
         back = clamp(angle - LOWER + ANGLE_SLOP, -MOST_TURN, 0.0f);

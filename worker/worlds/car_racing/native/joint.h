@@ -40,13 +40,13 @@ float joint_angle(const Joint *joint, const Rigid *bodies);
 /* Turns the motor, which wakes both bodies. */
 void joint_drive(Joint *joint, Rigid *bodies, float speed);
 
-/* Ready for the step's iterations; the impulse of the step before is applied, scaled by `ratio`. */
+/* Ready for the step's rounds; the impulse of the step before is applied, scaled by `ratio`. */
 void joint_begin(Joint *joint, const Rigid *bodies, Impulse *impulse, Motion *motions, float ratio);
 
-/* One iteration over the velocities. */
-void joint_hold(const Joint *joint, Impulse *impulse, Motion *motions, float dt);
+/* One round over the velocities of the hull and wheels of all its joints, the last joint first. */
+void joints_hold(const Joint *joints, int count, Impulse *impulses, Motion *motions, float dt);
 
-/* One iteration over the places; true if they are near enough to what the joint demands. */
+/* A round over the places; true if they are near enough to what the joint demands. */
 bool joint_mend(const Joint *joint, const Rigid *bodies, Place *places);
 
 #endif

@@ -4,8 +4,7 @@
 
 void rigid_init(Rigid *body, Vec at, float angle)
 {
-    *body = (Rigid){.pose = {at, turn_by(angle)}, .at = at, .at_before = at, .angle = angle, .angle_before = angle};
-    body->awake = true;
+    *body = (Rigid){.pose = {at, turn_by(angle)}, .at = at, .angle = angle, .awake = true};
 }
 
 void rigid_fix(Rigid *body, const Vec *points, int count)
@@ -29,7 +28,7 @@ void rigid_weigh(Rigid *body, float density)
     body->centre = vec_scale(body->by_mass, centre);
     moment -= whole * vec_dot(body->centre, body->centre);
     body->by_inertia = 1.0f / moment;
-    body->at = body->at_before = pose_out(body->pose, body->centre);
+    body->at = pose_out(body->pose, body->centre);
 }
 
 void rigid_wake(Rigid *body)
@@ -46,10 +45,14 @@ void rigid_rest(Rigid *body)
     body->velocity = body->force = (Vec){0, 0};
 }
 
+Pose rigid_pose(const Rigid *body, Turn turn)
+{
+    return (Pose){vec_sub(body->at, turn_out(turn, body->centre)), turn};
+}
+
 void rigid_place(Rigid *body)
 {
-    body->pose.turn = turn_by(body->angle);
-    body->pose.at = vec_sub(body->at, turn_out(body->pose.turn, body->centre));
+    body->pose = rigid_pose(body, turn_by(body->angle));
     for (int i = 0; i < body->fixtures; i++)
         polygon_place(&body->fixture[i].polygon, body->pose, body->fixture[i].world);
 }

@@ -13,10 +13,10 @@ typedef struct {
 } Fixture;
 
 typedef struct {
-    Pose pose;
-    Vec centre; /* of mass, in the body's frame */
-    Vec at, at_before;
-    float angle, angle_before;
+    Pose pose, before; /* now, and where its centre of mass says that it was before the step */
+    Vec centre;        /* of mass, in the body's frame */
+    Vec at;            /* where the centre is */
+    float angle;
     Vec velocity, force;
     float spin;
     float by_mass, by_inertia; /* one by them */
@@ -38,7 +38,10 @@ void rigid_weigh(Rigid *body, float density);
 void rigid_wake(Rigid *body);
 void rigid_rest(Rigid *body);
 
-/* Pose and corners follow from angle and centre of mass. */
+/* The pose that follows from angle and centre of mass. */
+Pose rigid_pose(const Rigid *body, Turn turn);
+
+/* Pose and corners follow them. */
 void rigid_place(Rigid *body);
 
 #endif

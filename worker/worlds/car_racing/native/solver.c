@@ -25,9 +25,8 @@ static void begin(Island *island, Round *round, float dt)
     float ratio = island->by_dt * dt;
     for (int i = 0; i < BODIES; i++) {
         Rigid *body = &island->bodies[i];
-        body->at_before = body->at;
-        body->angle_before = body->angle;
-        Vec push = vec_add((Vec){0, 0}, vec_scale(body->by_mass, body->force)); /* no gravity */
+        body->before = rigid_pose(body, body->pose.turn); /* a new body's origin says otherwise, by a rounding */
+        Vec push = vec_add((Vec){0, 0}, vec_scale(body->by_mass, body->force)); /* no gravity, and no torque */
         round->motions[i] = (Motion){vec_add(body->velocity, vec_scale(dt, push)), body->spin + 0.0f};
     }
     memcpy(round->impulses, island->impulses, sizeof round->impulses);
@@ -42,8 +41,7 @@ static void solve_velocities(const Island *island, Round *round, float dt, int r
 {
     Round seen = *round;
     for (int done = 0, seen_at = 0; done < rounds;) {
-        for (int i = WHEELS - 1; i >= 0; i--)
-            joint_hold(&island->joints[i], &round->impulses[i], round->motions, dt);
+        joints_hold(island->joints, WHEELS, round->impulses, round->motions, dt);
         done++;
         if (memcmp(round, &seen, sizeof seen) == 0) {
             rounds = done + (rounds - done) % (done - seen_at);
