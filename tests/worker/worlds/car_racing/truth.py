@@ -161,9 +161,9 @@ def held(environment: Any, random: np.random.Generator) -> Driver:
 
 
 def away(environment: Any, random: np.random.Generator) -> Driver:
-    """Full gas across the grass until the field ends."""
-    bend = random.uniform(-0.1, 0.1)
-    return lambda step: (bend if step < 60 else 0.0, 1.0, 0.0)
+    """Straight across the grass until the field ends."""
+    gas = random.uniform(0.3, 1)
+    return lambda _: (0.0, gas, 0.0)
 
 
 def at_rest(environment: Any, random: np.random.Generator) -> Driver:
@@ -199,7 +199,15 @@ def follow(environment: Any, random: np.random.Generator) -> Driver:
     return drive
 
 
-MANNERS = {"follow": follow, "wild": wild, "held": held, "away": away, "at rest": at_rest, "extreme": extreme, "still": still}
+MANNERS = {
+    "follow": follow,
+    "wild": wild,
+    "held": held,
+    "away": away,
+    "at rest": at_rest,
+    "extreme": extreme,
+    "still": still,
+}
 LONGEST = {"follow": 3000, "at rest": 3000, "still": 300, "away": 1500}
 BEYOND = ("away", "extreme", "follow")  # every other one of these drives on after its end
 
