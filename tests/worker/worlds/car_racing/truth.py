@@ -94,6 +94,20 @@ def their_tiles(environment: Any) -> bytes:
     )
 
 
+def their_contacts(environment: Any) -> list[tuple[int, int, bool]]:
+    """Box2D's contacts, the newest first, as `Race.contacts`."""
+    car = environment.car
+    movers = sorted(car.hull.fixtures, key=lambda fixture: -max(y for _, y in fixture.shape.vertices))
+    movers += [wheel.fixtures[0] for wheel in car.wheels]
+    found = []
+    for contact in reversed(environment.world.contacts):  # given with the oldest first
+        first, second = contact.fixtureA, contact.fixtureB
+        road = first.body.userData is not None and hasattr(first.body.userData, "road_friction")
+        tile, mover = (first, second) if road else (second, first)
+        found.append((tile.body.userData.idx, movers.index(mover), road))
+    return found
+
+
 def bits(value: Any) -> bytes:
     """A number's bits: 0.0 and -0.0 differ."""
     return struct.pack("d", float(value))
@@ -110,6 +124,8 @@ def compare_state(step: int, environment: Any, race: Any, tiles: bool) -> Differ
         if (theirs := their_tiles(environment)) != ours:
             index = next(i for i, pair in enumerate(zip(theirs, ours, strict=True)) if pair[0] != pair[1])
             return Difference(step, f"tile {index}", theirs[index], ours[index])
+        if (found := their_contacts(environment)) != (known := race.contacts()):
+            return Difference(step, "contacts", found, known)
     return None
 
 

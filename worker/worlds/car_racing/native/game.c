@@ -113,6 +113,24 @@ static PyObject *game_tiles(PyObject *self, PyObject *none)
     return bytes;
 }
 
+/* contacts(): the newest first, of each the tile, the fixture that moves (the hull's four, then the wheels), and whether
+   the tile is the first of the two; equal where the boxes of both worlds are equal, and all that their order decides */
+static PyObject *game_contacts(PyObject *self, PyObject *none)
+{
+    (void)none;
+    Race *race = &((Game *)self)->race;
+    PyObject *list = PyList_New(0);
+    for (int i = race->contact_count - 1; list && i >= 0; i--) {
+        Contact contact = race->contacts[i];
+        bool first = race->tiles[contact.tile].leaf < mover_fixture(race, contact.mover)->leaf;
+        PyObject *entry = Py_BuildValue("iiO", contact.tile, contact.mover, first ? Py_True : Py_False);
+        if (!entry || PyList_Append(list, entry) < 0)
+            Py_CLEAR(list);
+        Py_XDECREF(entry);
+    }
+    return list;
+}
+
 /* score(): reward so far, seconds, tiles visited, whether a new lap began */
 static PyObject *game_score(PyObject *self, PyObject *none)
 {
@@ -127,6 +145,7 @@ static PyMethodDef methods[] = {
     {"body", game_body, METH_O, "Where a wheel (0 to 3) or the hull (4) is, and how it moves."},
     {"wheel", game_wheel, METH_O, "How a wheel turns, and on how many tiles it stands."},
     {"tiles", game_tiles, METH_NOARGS, "What has touched each tile."},
+    {"contacts", game_contacts, METH_NOARGS, "Tiles and fixtures whose boxes meet."},
     {"score", game_score, METH_NOARGS, "What was reached."},
     {NULL, NULL, 0, NULL},
 };
