@@ -113,8 +113,8 @@ static PyObject *game_tiles(PyObject *self, PyObject *none)
     return bytes;
 }
 
-/* contacts(): the newest first, of each the tile, the fixture that moves (the hull's four, then the wheels), and whether
-   the tile is the first of the two; equal where the boxes of both worlds are equal, and all that their order decides */
+/* contacts(): the newest first, of each the tile, the fixture that moves (the hull's four, then the wheels), and
+   whether the tile is the first of the two; they show the boxes, their tree and its numbers */
 static PyObject *game_contacts(PyObject *self, PyObject *none)
 {
     (void)none;
