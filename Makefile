@@ -9,7 +9,7 @@ SOURCES := pyproject.toml constraints.txt $(wildcard worker/worlds/car_racing/na
 # Every process of every test would compile our modules again where an environment forbids the cache.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-doom test-newest short slow setup check long box2d-py simulate mutants chaos weekend fuzz sanitize bundle worker-size \
+.PHONY: demo test test-doom test-newest short slow setup check long proof box2d-py simulate mutants chaos weekend fuzz sanitize bundle worker-size \
   stranger reproduce reproduce-evolution messages keyed lock audit sbom structure words site reference clean
 
 demo: $(VENV)/.demo $(if $(filter takecover,$(WORLD)),$(VENV)/.demo-doom)  ## evolve a controller here (WORLD=takecover: there), judge it, plot it, record it
@@ -79,6 +79,9 @@ check: $(VENV)/.dev  ## style, types, import contracts, spelling, the site's lin
 long: $(VENV)/.dev  ## proofs that take half an hour: five run seeds of the demo improve
 	$(BIN)/pytest -m long --timeout 3600 $(ARGS)
 
+proof: $(VENV)/.dev  ## CarRacing against gymnasium: STEPS (3,000,000), a track and 100 pictures for each 1,000 steps: hours
+	PROOF_STEPS=$(or $(STEPS),3000000) $(BIN)/pytest -m long --timeout 40000 tests/worker/worlds/car_racing/test_race.py $(ARGS)
+
 box2d-py: $(VENV)/bin/python  ## the same library from its source archive instead of the wheel; needs a C++ compiler
 	$(PYTHON) -m venv .venv-box2d-py
 	.venv-box2d-py/bin/python -m pip install --quiet --constraint constraints.txt setuptools swig
@@ -102,7 +105,7 @@ chaos: $(VENV)/.dev  ## a fleet under FAULTS seeded faults gives the bits of one
 fuzz: $(VENV)/.dev  ## CALLS command lines with odd values, drawn by SEED, of every verb or of those that begin with VERB
 	$(BIN)/python -m tests.fuzz --calls $(or $(CALLS),2000) --seed $(or $(SEED),1) $(if $(VERB),--verb $(VERB)) $(ARGS)
 
-sanitize: $(VENV)/.dev  ## 200,000 steps of the native picture under AddressSanitizer: ten minutes
+sanitize: $(VENV)/.dev  ## 200,000 steps of the native CarRacing under AddressSanitizer: ten minutes
 	mkdir -p build
 	cc -std=c11 -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all -ffp-contract=off -fwrapv -shared -fPIC \
 	  -I$$($(BIN)/python -c "import sysconfig; print(sysconfig.get_path('include'))") \

@@ -47,7 +47,9 @@ def drive(steps: int) -> None:
         for step in range(int(random.integers(1, 2000))):
             if step % 50 == 0:
                 act = wild(random)
-                environment.car.hull.angle += random.choice([0.0, 0.5, np.pi / 2])
+                if random.random() < 0.3:
+                    hull = environment.car.hull
+                    environment.place(hull.angle + random.choice([0.0, 0.5, np.pi / 2]), *hull.position)
             environment.step(act())
             done += 1
         episode += 1

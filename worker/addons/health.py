@@ -6,10 +6,10 @@ from dreamfleet.common.addons.doctor.health import Finding
 
 
 def examine() -> Iterator[Finding]:
-    """Check that the native renderer was built and draws the same pictures as the installed gymnasium."""
+    """Check that the native CarRacing was built and is equal to the installed gymnasium's."""
     remedy = "install a C compiler, then pip install --force-reinstall --no-deps dreamfleet; gymnasium draws until then"
     try:
-        from dreamfleet.worker.worlds.car_racing.environment import is_native_available
+        from dreamfleet.worker.worlds.car_racing.environment import find_reference, is_native_available
         from dreamfleet.worker.worlds.car_racing.native_check import native_is_exact
     except ModuleNotFoundError as error:
         yield Finding("native picture", False, False, f"no {error.name}", "worker", "pip install 'dreamfleet[worker]'")
@@ -20,4 +20,5 @@ def examine() -> Iterator[Finding]:
         remedy = "install the tested versions of gymnasium and pygame-ce; gymnasium draws until then"
         yield Finding("native picture", False, False, "differs from gymnasium's", "worker", remedy)
     else:
-        yield Finding("native picture", True, False, "equal to gymnasium's", "worker", "")
+        found = "equal to gymnasium's" if find_reference() else "alone, and equal to a drive in gymnasium"
+        yield Finding("native picture", True, False, found, "worker", "")

@@ -17,7 +17,7 @@ from dreamfleet.worker.tasks.api import Assignment
 from dreamfleet.worker.tasks.model_free_policies import FlatPolicy
 from dreamfleet.worker.tasks.registry import find_task
 from dreamfleet.worker.worldmodel.inference import DreamStep
-from dreamfleet.worker.worlds.car_racing import environment
+from dreamfleet.worker.worlds.car_racing import reference
 from tests.support import tasks
 from tests.support.environments import ODD
 from tests.support.specs import described_spec
@@ -131,14 +131,18 @@ def test_the_host_class_does_not_depend_on_what_ran_before(random_bundle, task):
     assert scorer.score(*job) == again.score(*job) == score
 
 
-@pytest.mark.parametrize("task", [tasks.ROUNDED, "car-racing"])
-def test_another_bit_of_the_world_and_a_simulator_that_fuses_products_are_another_class(
-    random_bundle, monkeypatch, task
-):
-    here = scorer_of(task, random_bundle).host_class
+def test_another_bit_of_the_world_is_another_class(random_bundle, monkeypatch):
+    here = scorer_of(tasks.ROUNDED, random_bundle).host_class
     monkeypatch.setenv(tasks.ROUNDING, "1")
-    monkeypatch.setattr(environment, "box2d_fuses_products", lambda: True)
-    assert scorer_of(task, random_bundle).host_class != here
+    assert scorer_of(tasks.ROUNDED, random_bundle).host_class != here
+
+
+def test_who_drives_makes_no_class_but_a_simulator_that_fuses_products_does(random_bundle, monkeypatch):
+    here = scorer_of("car-racing", random_bundle).host_class
+    monkeypatch.setattr("dreamfleet.worker.worlds.car_racing.native_check.native_is_exact", lambda: False)
+    assert scorer_of("car-racing", random_bundle).host_class == here
+    monkeypatch.setattr(reference, "box2d_fuses_products", lambda: True)
+    assert scorer_of("car-racing", random_bundle).host_class != here
 
 
 def test_another_bit_of_a_policys_outputs_is_another_class_and_another_package_version_is_not(monkeypatch):

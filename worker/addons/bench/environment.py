@@ -125,7 +125,8 @@ def drive_lap(seed: int) -> RecordedDrive:
         position = np.array(hull.position)
         nearby = np.arange(here, here + 10) % len(middle)
         here = int(nearby[np.linalg.norm(middle[nearby] - position, axis=1).argmin()])
-        x, y = hull.GetLocalVector(middle[(here + 4) % len(middle)] - position)
+        (x, y), sine, cosine = middle[(here + 4) % len(middle)] - position, np.sin(hull.angle), np.cos(hull.angle)
+        x, y = cosine * x + sine * y, cosine * y - sine * x
         speed = float(np.hypot(*hull.linearVelocity))
         steer = np.clip(2 * np.arctan2(x, y), -1, 1)
         target = 45 - 25 * abs(steer)

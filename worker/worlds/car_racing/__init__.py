@@ -1,4 +1,4 @@
-"""CarRacing with gymnasium's physics: one with a natively drawn, bit-exact picture, one seen through a frozen encoder.
+"""CarRacing in native code, equal to gymnasium's to the bit: one with its picture, one seen through a frozen encoder.
 
 Importing this registers `dreamfleet/CarRacing-v3` and `dreamfleet/CarRacingLatent-v0` with gymnasium.
 
@@ -19,10 +19,10 @@ __all__ = ["task", "agents", "environment", "preprocessing", "native_check"]
 ENVIRONMENT = "dreamfleet/CarRacing-v3"
 LATENT = "dreamfleet/CarRacingLatent-v0"
 
-allow_swig_types()  # before Box2D is imported
+allow_swig_types()  # for Box2D, if it is imported
 gymnasium.register(
     id=ENVIRONMENT,
-    entry_point="dreamfleet.worker.worlds.car_racing.environment:CarRacing",
+    entry_point="dreamfleet.worker.worlds.car_racing.native_check:make_unwrapped",
     max_episode_steps=1000,
     reward_threshold=900,
 )

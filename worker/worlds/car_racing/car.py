@@ -1,109 +1,59 @@
-"""gymnasium's car and contact listener in the native module: the same arithmetic in the same order, but faster.
-
-gymnasium's loop works on NumPy scalars and queries Box2D for both axes of each wheel. `native/roll.c` makes the same
-IEEE operations, so forces and the state of each body are equal to the bit; `native_check` compares them. The native
-module reads bodies and contacts where Box2D keeps them, if they lie there as it assumes: `find_native` tries that once.
-"""
+"""The native race's car under the names that gymnasium's car and Box2D's bodies have."""
 
 from __future__ import annotations
 
-import logging
-from contextlib import suppress
-from functools import cache
-from types import ModuleType
-from typing import Any
+from typing import NamedTuple
 
-import Box2D
-from gymnasium.envs.box2d import car_dynamics, car_racing
+from dreamfleet.worker.worlds.car_racing._native import Race
 
-try:
-    from dreamfleet.worker.worlds.car_racing import _native
-except ImportError:  # no compiler when this was installed
-    _native = None  # type: ignore[assignment]
-
-_Base: Any = car_dynamics.Car  # untyped upstream
-_Listener: Any = car_racing.FrictionDetector  # untyped upstream
-log = logging.getLogger(__name__)
-STIFFNESS = 205_000
+HULL = 4  # bodies 0 to 3 are the wheels
+Pair = tuple[float, float]
 
 
-class Car(_Base):  # type: ignore[misc]
-    """A car whose controls are plain floats. Assigning `__class__` turns gymnasium's car into one."""
+class Body(NamedTuple):
+    """The hull: metres, radians and seconds."""
 
-    def steer(self, s: float) -> None:
-        """Turn the front wheels towards `s`, -1 to 1."""
-        left, right, *_ = self.wheels
-        left.steer = right.steer = float(s)
-
-    def gas(self, gas: float) -> None:
-        """Give gas, clipped to 0 to 1; it rises by at most 0.1 a step and falls at once."""
-        gas = min(max(float(gas), 0.0), 1.0)
-        for wheel in self.wheels[2:4]:
-            more = gas - wheel.gas
-            wheel.gas += more if more < 0.1 else 0.1
-
-    def brake(self, b: float) -> None:
-        """Brake all wheels; 0.9 or more locks them."""
-        b = float(b)
-        for wheel in self.wheels:
-            wheel.brake = b
-
-    def step(self, dt: float) -> None:
-        """Turn the wheels and apply their forces for `dt` seconds; the physics step follows."""
-        scale = STIFFNESS * car_dynamics.SIZE * car_dynamics.SIZE
-        engine, inertia = car_dynamics.ENGINE_POWER, car_dynamics.WHEEL_MOMENT_OF_INERTIA
-        _native.roll(self, dt, scale, engine, inertia, car_dynamics.FRICTION_LIMIT)
-
-    def skid(self, wheel: Any, grass: bool) -> None:
-        """Extend the wheel's skid mark, which `rgb_array` and `human` draw, or begin another; `roll.c` calls it."""
-        trace = wheel.skid_particle
-        if trace and trace.grass == grass and len(trace.poly) < 30:
-            position = wheel.position
-            trace.poly.append((position.x, position.y))
-        elif wheel.skid_start is None:
-            wheel.skid_start = wheel.position
-        else:
-            wheel.skid_particle = self._create_particle(wheel.skid_start, wheel.position, grass)
-            wheel.skid_start = None
+    position: Pair
+    angle: float
+    linearVelocity: Pair  # noqa: N815 - Box2D's name
+    angularVelocity: float  # noqa: N815 - Box2D's name
 
 
-class Listener(_Listener):  # type: ignore[misc]
-    """Notes which wheels touch which tiles. Assigning `__class__` turns gymnasium's listener into one."""
+class Joint(NamedTuple):
+    """What holds a wheel: how far it is turned against the hull."""
 
-    def BeginContact(self, contact: Any) -> None:  # noqa: N802 - Box2D's name
-        """A wheel or the hull comes upon a tile."""
-        _native.touch(self, contact, True)
-
-    def EndContact(self, contact: Any) -> None:  # noqa: N802 - Box2D's name
-        """It leaves the tile."""
-        _native.touch(self, contact, False)
+    angle: float
 
 
-class _Trial(Box2D.b2ContactListener):  # type: ignore[misc]
-    """Notes whether the native module knows how the contacts and bodies lie in memory."""
+class CarWheel(NamedTuple):
+    """A wheel as a body, how it turns, and on how many tiles it stands."""
 
-    known: bool | None = None
+    position: Pair
+    angle: float
+    linearVelocity: Pair  # noqa: N815 - Box2D's name
+    angularVelocity: float  # noqa: N815 - Box2D's name
+    omega: float
+    phase: float
+    gas: float
+    brake: float
+    steer: float
+    joint: Joint
+    tiles: int
 
-    def BeginContact(self, contact: Any) -> None:  # noqa: N802 - Box2D's name
-        with suppress(Exception):
-            self.known = self.known is not False and _native.knows(contact)
+
+class Car(NamedTuple):
+    """The hull and its wheels, the front ones first, at one moment."""
+
+    hull: Body
+    wheels: tuple[CarWheel, ...]
 
 
-@cache
-def find_native() -> ModuleType | None:
-    """The native module; `None` if it was not built, or if this Box2D lays out its bodies in another way."""
-    if _native is None:
-        return None
-    trial = _Trial()
-    world = Box2D.b2World(gravity=(0, 0), contactListener=trial)
-    for turn in (1, 2):
-        body = world.CreateDynamicBody(
-            position=(0.25 * turn, -0.5 * turn), angle=0.75 * turn, linearVelocity=(3.5 * turn, -4.5),
-            angularVelocity=turn, fixtures=Box2D.b2FixtureDef(shape=Box2D.b2PolygonShape(box=(2, 3)), density=1.0),
-        )  # fmt: skip
-        body.userData = body
-    world.Step(0.02, 1, 1)
-    if not trial.known:
-        log.warning("this Box2D keeps its bodies in another way than is known here: gymnasium drives and draws")
-        return None
-    return _native
+def read_car(race: Race) -> Car:
+    """The car of a race as it is now."""
+    bodies = [Body((x, y), angle, (vx, vy), spin) for x, y, angle, vx, vy, spin, _ in map(race.body, range(HULL + 1))]
+    turning = map(race.wheel, range(HULL))
+    wheels = (
+        CarWheel(*body, omega, phase, gas, brake, steer, Joint(angle), tiles)
+        for body, (omega, phase, gas, brake, steer, angle, tiles) in zip(bodies, turning, strict=False)
+    )
+    return Car(bodies[HULL], tuple(wheels))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dreamfleet.common.artifacts.bundle import Bundle
 from dreamfleet.worker.worldmodel.observation import Observation, open_bundle
 from dreamfleet.worker.worldmodel.recurrent_state import RecurrentState
+from dreamfleet.worker.worlds.car_racing.environment import find_reference
 from dreamfleet.worker.worlds.car_racing.native_check import make_car_racing
 from dreamfleet.worker.worlds.car_racing.task import WORLD, CarRacingTask, make_reference_environment
 
@@ -21,8 +22,8 @@ class CarRacingLatent(gymnasium.Env[Floats, Floats]):
     """Gymnasium's CarRacing with the observations and actions of `Dream`: latent `(latent,)`, actions `(3,)`.
 
     The latent is the encoder's mean; with `features` `zh` the MDN-RNN's hidden state follows it. Both equal what
-    controllers see, to the bit. Rewards, ends and `info` are gymnasium's. With `native` our module draws the picture
-    where that is exact, which is faster and changes nothing else.
+    controllers see, to the bit. Rewards, ends and `info` are gymnasium's. With `native`, and without Box2D or pygame,
+    our environment drives where that is exact, which is faster and changes nothing else.
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": WORLD.frames_per_second}  # noqa: RUF012
@@ -35,7 +36,7 @@ class CarRacingLatent(gymnasium.Env[Floats, Floats]):
         pictures = CarRacingTask().preprocessing(found)
         self._environment = (
             make_car_racing(preprocessing=pictures.name, render_mode=render_mode)
-            if native
+            if native or not find_reference()
             else make_reference_environment(pictures, render_mode)
         )
         self._mind, self._observation = RecurrentState(found), Observation(found, features)

@@ -1,30 +1,32 @@
-"""Compare the native picture with the installed gymnasium's: whether they are equal depends on how pygame was built.
+"""Compare the native environment with the installed gymnasium's, or with the hash of a drive in it; make either.
 
 Pages: troubleshooting.md.
 """
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
-import warnings
+import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.envs.box2d import car_racing
 from numpy.typing import NDArray
 
+from dreamfleet.common.errors import DreamfleetError
 from dreamfleet.worker.worlds.car_racing import ENVIRONMENT
-from dreamfleet.worker.worlds.car_racing.environment import PICTURES, CarRacing, is_native_available
+from dreamfleet.worker.worlds.car_racing.environment import PICTURES, CarRacing, find_reference, is_native_available
 from dreamfleet.worker.worlds.car_racing.preprocessing import BOX
 
-_Reference: Any = car_racing.CarRacing  # untyped upstream
 log = logging.getLogger(__name__)
 QUICK_SEED, QUICK_STEPS = 20_001, 24
+TRUTH = "66c44cadc653497616db877f4324b96efc95dba2bc0d531d2c46e92552b313ba"  # of `hash_drive` with gymnasium and Box2D
 CHECK_INTERVAL = 50  # pictures; of an environment that judges, gymnasium draws one in so many too
 ActionSource = Callable[[int, NDArray[np.uint8], np.random.Generator], Any]  # step, 64x64 picture
 
@@ -40,22 +42,35 @@ class Mismatch:
 
 @cache
 def native_is_exact() -> bool:
-    """Whether the native picture equals gymnasium's on this machine; checked once per process, in under a second.
+    """Whether the native environment equals gymnasium's on this machine; checked once per process, in under a second.
 
+    Where Box2D or pygame cannot be imported, the hash of a drive decides: `DreamfleetError` if it is another one.
     False also where the environment variable `DREAMFLEET_PICTURES` is `gymnasium`.
     """
     if os.environ.get(PICTURES) == "gymnasium":
         return False
     if not is_native_available():
-        log.warning("no native picture was built (no C compiler at installation): gymnasium draws, 15 times slower")
+        log.warning("nothing native was built (no C compiler at installation): gymnasium drives, 15 times slower")
         return False
+    if find_reference() is None:
+        if (found := hash_drive(CarRacing(), CarRacing(preprocessing=BOX.name))) != TRUTH:
+            raise DreamfleetError(
+                f"this host computes another drive ({found[:12]}) than gymnasium and Box2D on x86-64 ({TRUTH[:12]}): "
+                "install box2d and pygame-ce, and gymnasium drives; please report this, with the processor's name"
+            )
+        return True
     difference = compare(QUICK_SEED, QUICK_STEPS, random_action)
     if difference is not None:
         log.warning(
-            "the native picture differs from the installed gymnasium's (%s): gymnasium draws; pygame-ce or gymnasium "
-            "may be another version than the supported ones", difference.what,
+            "the native environment differs from the installed gymnasium's (%s): gymnasium drives; pygame-ce, Box2D or "
+            "gymnasium may be another version than the supported ones", difference.what,
         )  # fmt: skip
     return difference is None
+
+
+def judge_name() -> str:
+    """Who judges scores here, as reports say it."""
+    return "gymnasium" if find_reference() else "the native core, with which a drive in gymnasium 1.4.0 agrees"
 
 
 def random_action(step: int, _picture: Any, random: np.random.Generator) -> NDArray[np.float32]:
@@ -69,28 +84,45 @@ def compare(seed: int, steps: int, actions: ActionSource, **settings: Any) -> Mi
 
     It compares observation, picture, reward, flags, info, and the state of each body.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # SWIG's, on first import
-        theirs, ours = _Reference(**settings), CarRacing(**settings)
-        small = CarRacing(**settings, preprocessing=BOX.name)
-    random = np.random.default_rng(seed)
-    quick = steps <= QUICK_STEPS
+    theirs, ours = _reference().GymnasiumCarRacing(**settings), CarRacing(**settings)
+    environments = theirs, ours, CarRacing(**settings, preprocessing=BOX.name)
     try:
-        results = [each.reset(seed=seed) for each in (theirs, ours, small)]
-        for step in range(steps):
-            if what := find_mismatch(results, (theirs, ours, small)):
+        for step, results in enumerate(drive(environments, seed, steps, actions)):
+            if what := find_mismatch(results, environments):
                 return Mismatch(what, seed, step)
-            if step and results[0][2]:
-                return None
-            action = actions(step, results[2][0], random)
-            results = [each.step(action) for each in (theirs, ours, small)]
-            if quick and step % 8 == 7:
-                for each in (theirs, ours, small):
-                    each.t += 0.4  # shortens the opening zoom, which lasts a second
         return None
     finally:
-        for each in (theirs, ours, small):
+        for each in environments:
             each.close()
+
+
+def drive(
+    environments: tuple[Any, ...], seed: int, steps: int, actions: ActionSource
+) -> Iterator[list[tuple[Any, ...]]]:
+    """Drive environments side by side by the pictures of the last one; yield what each gave, at the reset and after."""
+    random = np.random.default_rng(seed)
+    results = [each.reset(seed=seed) for each in environments]
+    yield results
+    for step in range(steps):
+        action = actions(step, results[-1][0], random)
+        results = [each.step(action) for each in environments]
+        if steps <= QUICK_STEPS and step % 8 == 7:
+            for each in environments:
+                each.t += 0.4  # shortens the opening zoom, which lasts a second
+        yield results
+        if results[0][2]:
+            return
+
+
+def hash_drive(*environments: Any) -> str:
+    """The digest of a short drive in environments side by side: pictures, rewards and the state of each body."""
+    digest = hashlib.sha256()
+    for results in drive(environments, QUICK_SEED, QUICK_STEPS, random_action):
+        for environment, (picture, *rest) in zip(environments, results, strict=True):
+            state = [value for row in body_state(environment) for value in row]
+            digest.update(picture.tobytes() + struct.pack(f"<{len(state)}d", *state) + repr(rest[1:]).encode())
+            digest.update(struct.pack("<d", rest[0] if rest[1:] else 0.0))
+    return digest.hexdigest()
 
 
 def find_mismatch(results: list[Any], environments: tuple[Any, ...]) -> str | None:
@@ -116,5 +148,20 @@ def body_state(environment: Any) -> Iterator[tuple[float, ...]]:
 
 
 def make_car_racing(**settings: Any) -> gymnasium.Env[Any, Any]:
-    """Make `dreamfleet/CarRacing-v3`, drawn natively where that is exact, else by gymnasium."""
+    """Make `dreamfleet/CarRacing-v3`, native where that is exact, else gymnasium's."""
     return gymnasium.make(ENVIRONMENT, native=native_is_exact(), disable_env_checker=True, **settings)
+
+
+def make_unwrapped(native: bool = True, **settings: Any) -> gymnasium.Env[Any, Any]:
+    """What `dreamfleet/CarRacing-v3` is without wrappers: native, or gymnasium's where nothing native was built."""
+    if native and is_native_available():
+        return CarRacing(**settings)
+    made: gymnasium.Env[Any, Any] = _reference().GymnasiumCarRacing(
+        **{name: value for name, value in settings.items() if name != "checked"}
+    )
+    return made
+
+
+def _reference() -> Any:
+    """The module `reference`; `ModuleNotFoundError` or gymnasium's error where Box2D or pygame is missing."""
+    return find_reference() or import_module("dreamfleet.worker.worlds.car_racing.reference")

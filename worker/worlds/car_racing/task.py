@@ -9,9 +9,7 @@ from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
-import pygame
 from gymnasium import spaces
-from gymnasium.envs.box2d.car_dynamics import Car
 from gymnasium.wrappers import TransformObservation
 
 from dreamfleet.common.artifacts.actions import STEERING_GAS_BRAKE, Mirror
@@ -23,7 +21,13 @@ from dreamfleet.worker.tasks.recordable import Preprocessing
 from dreamfleet.worker.tasks.registry import preprocessing_for
 from dreamfleet.worker.worldmodel.policy import ModelPolicy
 from dreamfleet.worker.worlds.car_racing.drivers import DRIVERS, PushedDriver, UniformDriver
-from dreamfleet.worker.worlds.car_racing.native_check import CHECK_INTERVAL, make_car_racing, native_is_exact
+from dreamfleet.worker.worlds.car_racing.environment import find_reference
+from dreamfleet.worker.worlds.car_racing.native_check import (
+    CHECK_INTERVAL,
+    judge_name,
+    make_car_racing,
+    native_is_exact,
+)
 from dreamfleet.worker.worlds.car_racing.preprocessing import BOX, PREPROCESSINGS, find_preprocessing
 from dreamfleet.worker.worlds.car_racing.random_network import RandomNetworkPolicy
 from dreamfleet.worker.worlds.car_racing.true_state import read_true_state
@@ -72,7 +76,7 @@ class CarRacingTask(Task):
         variant = assignment.world_model.variant
         return replace(
             WORLD, actions=variant.controls, version=variant.version, time_cost=variant.time_cost,
-            off_course_cost=variant.offroad_cost,
+            off_course_cost=variant.offroad_cost, judge=judge_name(),
         )  # fmt: skip
 
     def make_environment(self, assignment: Assignment) -> gymnasium.Env[Any, Any]:
@@ -105,10 +109,7 @@ class CarRacingTask(Task):
         inner: Any = environment.unwrapped
         _, beta, x, y = inner.track[random.integers(len(inner.track))]
         shift, turn = random.normal(0, 2.0), random.normal(0, 0.25)
-        inner.car.destroy()
-        inner.car = Car(  # type: ignore[no-untyped-call]
-            inner.world, beta + turn, x + shift * np.cos(beta), y + shift * np.sin(beta)
-        )
+        inner.place(beta + turn, x + shift * np.cos(beta), y + shift * np.sin(beta))
         inner.t = 1.0  # the camera zooms in during the first second
         return environment.step(np.zeros(3, dtype=np.float32))[0]
 
@@ -130,29 +131,32 @@ class CarRacingTask(Task):
 
 
 class CarRacingScene:
-    """CarRacing, drawn by gymnasium at its full size of 1000x800."""
+    """CarRacing, drawn by gymnasium at its full size of 1000x800; without Box2D the observation with larger pixels."""
 
     name, scale = "CarRacing", 1.0
 
     def __init__(self, steps: int) -> None:
         self.environment = make_car_racing(preprocessing=BOX.name, render_mode="rgb_array", max_episode_steps=steps)
 
-    def surface(self) -> pygame.Surface:
-        """Gymnasium's own surface; `render` returns a smaller copy."""
-        self.environment.render()
+    def surface(self) -> Any:
+        """The picture as a surface of pygame; gymnasium's own one, of which `render` returns a smaller copy."""
+        import pygame
+
+        picture: Any = self.environment.render()
         inner: Any = self.environment.unwrapped
-        drawn: pygame.Surface = inner.surf
-        return drawn
+        drawn = getattr(inner, "shadow", inner)  # gymnasium's environment, which may be all that there is
+        return pygame.surfarray.make_surface(picture.transpose(1, 0, 2)) if drawn is None else drawn.surf
 
 
 def make_judging_environment(preprocessing: Preprocessing, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
     """Make the environment that reported scores come from, observing the pictures of a preprocessing.
 
-    It is gymnasium's unmodified one, unless the native picture is exact here and nobody watches. Gymnasium then draws
-    the first and every 50th picture too, and an episode ends with an error at the first difference.
+    It is gymnasium's unmodified one, unless the native one is exact here and nobody watches. Gymnasium's then drives
+    along and draws the first and every 50th picture too, and an episode ends with an error at the first difference.
+    Where Box2D or pygame cannot be imported, the native one judges alone, and reports say so.
     """
-    if render_mode is None and native_is_exact():
-        return make_car_racing(preprocessing=preprocessing.name, checked=CHECK_INTERVAL)
+    if not (render_mode and find_reference()) and native_is_exact():
+        return make_car_racing(preprocessing=preprocessing.name, render_mode=render_mode, checked=CHECK_INTERVAL)
     return make_reference_environment(preprocessing, render_mode)
 
 

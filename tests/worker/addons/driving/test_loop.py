@@ -1,6 +1,7 @@
 """Driving by hand, also on a virtual screen; no display is opened without need.
 Tests drive_window.py, loop.py, picture_window.py and verb.py."""
 
+import math
 import os
 import re
 import subprocess
@@ -51,7 +52,7 @@ class Hand:
         self.frames += 1
         self.steps.append(step)
         if self._scene:
-            self.speeds.append(self._scene.environment.unwrapped.car.hull.linearVelocity.length)
+            self.speeds.append(math.hypot(*self._scene.environment.unwrapped.car.hull.linearVelocity))
         for event in self._keys.get(self.frames, ()):
             pygame.event.post(event)
 

@@ -1,14 +1,12 @@
 """The native picture is gymnasium's, to the bit. `dreamfleet lab bench env --exact` compares far more.
-Tests car.py, environment.py, native_check.py, preprocessing.py and worker/addons/bench/environment.py."""
+Tests car.py, environment.py, native_check.py, preprocessing.py, reference.py and worker/addons/bench/environment.py."""
 
 import copy
-from array import array
 from functools import cache
 
 import gymnasium
 import numpy as np
 import psutil
-import pygame
 import pytest
 from gymnasium.error import InvalidAction
 from gymnasium.utils.env_checker import check_env
@@ -19,18 +17,26 @@ from dreamfleet.common.errors import UsageError
 from dreamfleet.worker.addons.bench.environment import drive_lap, make_random_policy, random_discrete_action
 from dreamfleet.worker.tasks.pictures import box_resize
 from dreamfleet.worker.training.data.dataset import preprocessing_of_size
-from dreamfleet.worker.worlds.car_racing import car
+from dreamfleet.worker.worlds.car_racing import native_check
 from dreamfleet.worker.worlds.car_racing.environment import (
-    GRASS,
     PICTURES,
-    WHEEL,
+    TEXTS,
     CarRacing,
-    _native,
     is_native_available,
     render_score,
-)  # fmt: skip
-from dreamfleet.worker.worlds.car_racing.native_check import compare, make_car_racing, native_is_exact, random_action
+    write_score,
+)
+from dreamfleet.worker.worlds.car_racing.native_check import (
+    TRUTH,
+    compare,
+    hash_drive,
+    make_car_racing,
+    make_unwrapped,
+    native_is_exact,
+    random_action,
+)
 from dreamfleet.worker.worlds.car_racing.preprocessing import BOX, PREPROCESSINGS, RAW, WHOLE, find_preprocessing
+from dreamfleet.worker.worlds.car_racing.reference import GymnasiumCarRacing
 from dreamfleet.worker.worlds.car_racing.task import make_judging_environment
 
 EXTREMES = [(9, 9, 9), (-9, -9, -9), (1e6, 1, 0), (-1, 1, 1), (0, 0, 0)]
@@ -71,6 +77,8 @@ def test_a_completed_lap_looks_the_same_to_its_end():
 @needs_native
 @pytest.mark.parametrize("width", [1, 2])
 def test_wider_instructions_change_no_bit(width):
+    from dreamfleet.worker.worlds.car_racing import _native
+
     if _native.widen(width) != width:
         _native.widen(2)
         pytest.skip("this processor has none")
@@ -115,18 +123,6 @@ def test_one_more_environment_adds_little_memory():
     assert process.memory_info().rss - before < 6 * 2**20
 
 
-@needs_native
-@pytest.mark.parametrize("x", [np.nan, np.inf, 1e30])
-def test_a_car_that_cannot_be_drawn_is_a_clear_error(x):
-    environment = CarRacing(preprocessing="box-64")
-    environment.reset(seed=1)
-    with pytest.raises(ValueError, match="too far away"):
-        _native.scene(
-            np.empty((96, 96, 3), np.uint8), environment._road, environment._road_colours, GRASS, environment._palette,
-            np.array([16.2, 0, x, 0, 333]), np.zeros((5, 4)), environment._fixtures, WHEEL,
-        )  # fmt: skip
-
-
 @pytest.mark.slow
 @needs_native
 @pytest.mark.parametrize("name", PREPROCESSINGS)
@@ -137,14 +133,24 @@ def test_a_judging_environment_goes_on_while_pictures_are_equal(name):
 
 
 @needs_native
-def test_a_wrong_picture_ends_an_evaluation(monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("_draw", lambda right, self, shape: right(self, shape) ^ (np.indices(shape).sum(axis=0) == 0)),
+        ("step", lambda right, self, action: right(self, action * np.float32(0.5))),
+    ],
+)
+def test_another_picture_or_reward_ends_an_evaluation(monkeypatch, name, wrong):
     environment = make_judging_environment(BOX)
     environment.reset(seed=1)
-    right = CarRacing._draw
-    monkeypatch.setattr(CarRacing, "_draw", lambda self: right(self) ^ (np.indices(BOX.shape).sum(axis=0) == 0))
-    still = np.zeros(3, np.float32)
+    inner = environment.unwrapped
+    right = getattr(CarRacing, name)
+    if name == "step":
+        monkeypatch.setattr(inner.shadow, "step", lambda action: type(inner.shadow).step(inner.shadow, action / 2))
+    else:
+        monkeypatch.setattr(CarRacing, name, lambda self, given: wrong(right, self, given))
     with pytest.raises(DreamfleetError, match="PICTURES=gymnasium"):
-        [environment.step(still) for _ in range(50)]
+        [environment.step(np.array([0, 1, 0], np.float32)) for _ in range(50)]
 
 
 @pytest.mark.parametrize(("said", "by"), [("", "native"), ("gymnasium", "gymnasium")])
@@ -158,35 +164,35 @@ def test_a_user_may_let_gymnasium_draw(monkeypatch, said, by):
     assert getattr(make_judging_environment(BOX, "rgb_array").unwrapped, "drawn_by", "-") == "-"
 
 
-@needs_native
-def test_where_gymnasium_draws_it_drives_too(monkeypatch):
-    monkeypatch.setattr("dreamfleet.worker.worlds.car_racing.car.STIFFNESS", 100_000)  # as if we computed otherwise
-    action, positions = np.array([0.3, 0.8, 0], np.float32), []
-    for environment in (gymnasium.make("CarRacing-v3").unwrapped, CarRacing(native=False), CarRacing()):
-        environment.reset(seed=3)
-        for _ in range(40):
-            environment.step(action)
-        positions.append(tuple(environment.car.hull.position))
-    assert positions[0] == positions[1] != positions[2]
-
-
-def test_where_it_was_not_built_gymnasium_draws_and_a_copy_draws_as_its_original():
-    ours, small = CarRacing(native=False), CarRacing(native=False, preprocessing="box-64")
+def test_where_it_was_not_built_gymnasium_drives_and_a_copy_is_made_as_its_original(monkeypatch):
+    monkeypatch.setattr(native_check, "is_native_available", lambda: False)
+    ours, small = make_unwrapped(checked=7), make_unwrapped(preprocessing="box-64")
     observation, small_one = ours.reset(seed=1)[0], small.reset(seed=1)[0]
     assert ours.drawn_by == "gymnasium"
     assert np.array_equal(BOX.picture(observation), small_one)
-    copied = copy.deepcopy(CarRacing(preprocessing="box-64", native=False, checked=7, domain_randomize=True))
-    assert (copied._checked, copied.drawn_by, copied.domain_randomize) == (7, "gymnasium", True)
-    assert copied.observation_space.shape == BOX.shape
+    copied = copy.deepcopy(GymnasiumCarRacing(preprocessing="box-64", domain_randomize=True))
+    assert (copied.domain_randomize, copied.observation_space.shape) == (True, BOX.shape)
+
+
+@needs_native
+def test_a_copy_of_the_native_one_is_made_as_its_original():
+    copied = copy.deepcopy(CarRacing(preprocessing="box-64", checked=7, domain_randomize=True))
+    assert (copied._checked, copied.domain_randomize, copied.observation_space.shape) == (7, True, BOX.shape)
+
+
+@needs_native
+def test_the_hash_of_a_drive_is_gymnasiums():
+    for kind in (GymnasiumCarRacing, CarRacing):
+        assert hash_drive(kind(), kind(preprocessing=BOX.name)) == TRUTH
 
 
 @pytest.mark.parametrize("action", [np.array([np.nan, 0, 0]), np.array([0, np.inf, 0]), np.zeros(2), np.zeros((1, 3))])
 def test_an_action_that_is_none_is_refused_and_the_environment_goes_on(action):
-    environment = CarRacing()
-    environment.reset(seed=1)
-    with pytest.raises(InvalidAction):
-        environment.step(action)
-    environment.step(np.zeros(3, np.float32))
+    for environment in (CarRacing(), GymnasiumCarRacing()):
+        environment.reset(seed=1)
+        with pytest.raises(InvalidAction):
+            environment.step(action)
+        environment.step(np.zeros(3, np.float32))
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -198,33 +204,9 @@ def test_gymnasium_finds_it_a_well_made_environment():
     assert environment.render().shape == (400, 600, 3)
 
 
-def test_a_score_is_written_after_somebody_closed_pygame():
-    before = render_score("0012").copy()
-    pygame.quit()
-    render_score.cache_clear()
-    assert np.array_equal(render_score("0012"), before)
-
-
-@needs_native
-def test_a_box2d_that_keeps_its_bodies_elsewhere_is_not_read(monkeypatch, caplog):
-    monkeypatch.setattr(car._native, "knows", lambda _contact: False)
-    assert car.find_native.__wrapped__() is None
-    assert [each.levelname for each in caplog.records] == ["WARNING"]
-
-
-@needs_native
-def test_what_is_read_is_what_box2d_says():
-    environment = CarRacing(preprocessing="box-64")
-    environment.reset(seed=1)
-    for _ in range(30):
-        environment.step(np.array([0.3, 1.0, 0.0]))
-    seen = array("d", bytes(8 * 20))
-    car.find_native().look(seen, environment.car)
-    bodies = (*environment.car.wheels, environment.car.hull)
-    true = [(*body.position, body.angle, getattr(body, "phase", 0.0)) for body in bodies]
-    assert np.array_equal(np.reshape(seen, (5, 4)), true)
-    with pytest.raises(AttributeError, match="this"):
-        car.find_native().touch(object(), object(), True)
+def test_the_kept_texts_are_pygames_and_another_one_is_written():
+    for text in (*TEXTS[::50], TEXTS[-1], "-000", "-4567"):
+        assert np.array_equal(render_score(text), write_score(text)), text
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -4,11 +4,11 @@ through a world model. Tests latent.py, worker/tasks/true_state.py and worker/wo
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.envs.box2d.car_dynamics import Car
 from gymnasium.utils.env_checker import check_env
 
 from dreamfleet.common.errors import UsageError
@@ -65,8 +65,7 @@ def put(environment, tile, aside=0.0, turn=0.0):
     """Move the car beside a track's point, standing still."""
     inner = environment.unwrapped
     _, beta, x, y = inner.track[tile]
-    inner.car.destroy()
-    inner.car = Car(inner.world, beta + turn, x - aside * math.cos(beta), y - aside * math.sin(beta))
+    inner.place(beta + turn, x - aside * math.cos(beta), y - aside * math.sin(beta))
     return read_true_state(inner)
 
 
@@ -112,8 +111,9 @@ def test_side_slip_is_speed_to_the_left(environment):
     put(environment, 30)
     hull = environment.unwrapped.car.hull
     sine, cosine = math.sin(hull.angle), math.cos(hull.angle)
-    hull.linearVelocity = -10 * sine - 3 * cosine, 10 * cosine - 3 * sine
-    truth = read_true_state(environment.unwrapped)
+    hull = hull._replace(linearVelocity=(-10 * sine - 3 * cosine, 10 * cosine - 3 * sine))
+    car = environment.unwrapped.car._replace(hull=hull)
+    truth = read_true_state(SimpleNamespace(car=car, track=environment.unwrapped.track))
     assert (truth["side_slip"], truth["speed"]) == pytest.approx((3, math.hypot(10, 3)), rel=1e-5)
 
 

@@ -1,7 +1,7 @@
-"""Drives gymnasium's CarRacing and the native `Race` side by side without pictures and compares all of their state.
+"""Drives gymnasium's CarRacing and ours side by side and compares all of their state, and one picture in so many.
 
-`python -m tests.worker.worlds.car_racing.truth --steps 200000` alternates manners of driving and tracks, and prints the
-first difference: its step, what it is of, and both values.
+`python -m tests.worker.worlds.car_racing.truth --steps 200000 --pictures 10` alternates manners of driving, settings
+and tracks, and prints the first difference: its step, what it is of, and both values. With 0 no picture is drawn.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import math
 import struct
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,22 +17,30 @@ from typing import Any
 import numpy as np
 from gymnasium.envs.box2d import car_racing
 
-from dreamfleet.worker.worlds.car_racing import _native
+from dreamfleet.worker.worlds.car_racing.environment import CarRacing
+from dreamfleet.worker.worlds.car_racing.preprocessing import BOX, RAW
+from dreamfleet.worker.worlds.car_racing.reference import Shadow
 from dreamfleet.worker.worlds.car_racing.true_state import centre_line, wrap_angle
 
-_Base: Any = car_racing.CarRacing  # untyped upstream
 Action = tuple[float, float, float]
 Driver = Callable[[int], Action]
 FIELDS = ("x", "y", "angle", "velocity x", "velocity y", "spin", "awake")
 WHEEL_FIELDS = ("omega", "phase", "gas", "brake", "steer", "joint angle", "tiles")
-HULL = 4
+HULL, FAR = 4, 9e4  # body; metres, within which a car is drawn
+SETTINGS: tuple[dict[str, Any], ...] = (
+    {}, {"lap_complete_percent": 0.3}, {"domain_randomize": True}, {"continuous": False},
+)  # fmt: skip
 
 
-class Blind(_Base):  # type: ignore[misc]
-    """gymnasium's CarRacing that draws nothing."""
+class Ours(CarRacing):
+    """Ours, which draws only for `observe`."""
 
-    def _render(self, mode: str) -> None:
+    def _observe(self) -> Any:
         return None
+
+    def observe(self) -> list[Any]:
+        """The observation, and the small picture."""
+        return [self._draw(RAW.shape), self._draw(BOX.shape)]
 
 
 @dataclass(frozen=True)
@@ -46,16 +53,19 @@ class Difference:
     ours: Any
 
 
-def tile_corners(environment: Any) -> np.ndarray[Any, Any]:
-    """The tiles' corners `(N, 4, 2)`: the road's polygons but for its borders."""
-    colours = {id(tile.color) for tile in environment.road}
-    return np.array([corners for corners, colour in environment.road_poly if id(colour) in colours], np.float64)
-
-
-def start(race: Any, environment: Any) -> None:
-    """Begin the episode that gymnasium has begun."""
-    lap = environment.lap_complete_percent
-    race.reset(tile_corners(environment), tuple(map(float, environment.track[0][1:4])), lap)
+def compare_tracks(environment: Any, ours: Ours) -> Difference | None:
+    """The first difference of centre line, road and colours."""
+    tiles = {id(tile.color): index for index, tile in enumerate(environment.road)}
+    road = [([float(each) for corner in corners for each in corner], tiles.get(id(colour)))
+            for corners, colour in environment.road_poly]  # fmt: skip
+    own = [(list(corners), None if border else tile) for corners, tile, border in ours.race.road()]
+    colours = [each.tolist() for each in (environment.road_color, environment.bg_color, environment.grass_color)]
+    sides = {
+        "track": ([tuple(map(float, each)) for each in environment.track], ours.track),
+        "road": (road, own),
+        "colours": (colours, [each.tolist() for each in ours.colours]),
+    }
+    return next((Difference(0, what, *pair) for what, pair in sides.items() if pair[0] != pair[1]), None)
 
 
 def their_state(environment: Any) -> Iterator[tuple[str, Any]]:
@@ -129,25 +139,46 @@ def compare_state(step: int, environment: Any, race: Any, tiles: bool) -> Differ
     return None
 
 
+def compare_pictures(step: int, environment: Any, ours: Ours) -> Difference | None:
+    """The pixels that differ, if any do."""
+    observation = environment.observe()
+    for what, theirs, own in zip(("observation", "picture"), (observation, BOX.picture(observation)), ours.observe(),
+                                 strict=True):  # fmt: skip
+        if found := int((theirs != own).any(axis=-1).sum()):
+            return Difference(step, what, found, 0)
+    return None
+
+
+def choice(action: Action) -> int:
+    """The discrete action that comes near."""
+    steering, gas, brake = action
+    return 1 if steering > 0.3 else 2 if steering < -0.3 else 3 if gas > 0.4 else 4 if brake > 0.3 else 0
+
+
 def race_against(
-    environment: Any, race: Any, seed: int, drive: Driver, steps: int, counts: Counter[str], beyond: bool = False
-) -> Difference | None:
+    environment: Any, ours: Ours, seed: int, drive: Driver, steps: int, counts: Counter[str], beyond: bool = False,
+    pictures: int = 0,
+) -> Difference | None:  # fmt: skip
     """One episode, or with `beyond` all the steps, whatever it says of its end; the first difference."""
-    environment.reset(seed=seed)
-    start(race, environment)
-    difference = compare_state(0, environment, race, tiles=True)
+    if environment.domain_randomize:
+        ours.colours = (environment.road_color, environment.bg_color, environment.grass_color)
+    for each in (environment, ours):
+        each.reset(seed=seed, options={"randomize": bool(seed % 4)})
+    difference = compare_tracks(environment, ours) or compare_state(0, environment, ours.race, tiles=True)
     for step in range(1, steps + 1):
         if difference:
             break
-        action = drive(step)
-        _, reward, over, _, info = environment.step(np.array(action, np.float64))
-        ours = race.step(*action)
-        told = (float(reward), info.get("lap_finished"))
-        difference = compare_state(step, environment, race, tiles=over or step % 10 == 0)
-        if bits(told[0]) != bits(ours[0]) or told[1] is not ours[1]:
-            difference = Difference(step, "reward and end", told, ours)
+        action: Any = np.array(drive(step), np.float64) if ours.continuous else choice(drive(step))
+        _, reward, over, _, info = environment.step(action)
+        _, own_reward, own_over, _, own_info = ours.step(action)
+        difference = compare_state(step, environment, ours.race, tiles=over or step % 10 == 0)
+        if bits(reward) != bits(own_reward) or (over, info) != (own_over, own_info):
+            difference = Difference(step, "reward and end", (reward, over, info), (own_reward, own_over, own_info))
+        if pictures and (step + seed) % pictures == 0 and max(map(abs, environment.car.hull.position)) < FAR:
+            difference = difference or compare_pictures(step, environment, ours)
+            counts["pictures"] += 1
         counts["steps"] += 1
-        counts["steps asleep"] += not race.body(HULL)[-1]
+        counts["steps asleep"] += not ours.race.body(HULL)[-1]
         if over and not beyond:
             break
     counts["laps"] += environment.new_lap or environment.tile_visited_count == len(environment.track)
@@ -228,65 +259,57 @@ LONGEST = {"follow": 3000, "at rest": 3000, "still": 300, "away": 1500}
 BEYOND = ("away", "extreme", "follow")  # every other one of these drives on after its end
 
 
-def compare(steps: int, seed: int = 1, fresh_every: int = 9) -> tuple[Counter[str], Difference | None]:
-    """Alternate tracks and manners for so many steps: what happened, and the first difference.
+def compare(
+    steps: int, seed: int = 1, pictures: int = 0, fresh_every: int = 9
+) -> tuple[Counter[str], Difference | None]:
+    """Alternate tracks, manners and settings for so many steps: what happened, and the first difference.
 
     An environment lives for `fresh_every` episodes, for gymnasium's world keeps traces of those before.
     """
     counts: Counter[str] = Counter()
     difference = None
     environment: Any = None
-    race: Any = None
+    ours: Any = None
     while counts["steps"] < steps and difference is None:
         episode = counts["episodes"]
         if episode % fresh_every == 0:
-            environment, race = Blind(lap_complete_percent=(0.95, 0.3)[episode % 2]), _native.Race()
+            settings = SETTINGS[episode // fresh_every % len(SETTINGS)]
+            environment, ours = Shadow(**settings), Ours(**settings)
         name = list(MANNERS)[episode % len(MANNERS)]
         drive = MANNERS[name](environment, np.random.default_rng(seed + episode))
         beyond = name in BEYOND and episode // len(MANNERS) % 2 == 1
-        difference = race_against(environment, race, seed + episode, drive, LONGEST.get(name, 1000), counts, beyond)
+        longest = LONGEST.get(name, 1000)
+        difference = race_against(environment, ours, seed + episode, drive, longest, counts, beyond, pictures)
         if difference:
             print(f"{name}, seed {seed + episode}, episode {episode % fresh_every} of its environment")
         counts["episodes"] += 1
     return counts, difference
 
 
-def time_both(steps: int, seed: int = 5, block: int = 50) -> tuple[float, float]:
-    """Microseconds a step of Box2D and gymnasium's car without a picture, and of the native race, in turns."""
-    environment, race = Blind(), _native.Race()
-    spent = [0.0, 0.0]
-    random = np.random.default_rng(seed)
-    done = 0
-    while done < steps:
-        environment.reset(seed=seed + done)
-        start(race, environment)
-        drive = held(environment, random)
-        for first in range(1, 1000, block):
-            actions = [drive(step) for step in range(first, first + block)]
-            arrays = [np.array(action) for action in actions]
-            begin = time.process_time()
-            over = [environment.step(action)[2] for action in arrays][-1]
-            middle = time.process_time()
-            for action in actions:
-                race.step(*action)
-            spent[0] += middle - begin
-            spent[1] += time.process_time() - middle
-            done += block
-            if over or done >= steps:
-                break
-    return spent[0] / done * 1e6, spent[1] / done * 1e6
+def compare_seeds(seeds: range) -> Difference | None:
+    """The first track that differs."""
+    environment, ours = Shadow(), Ours()
+    for seed in seeds:
+        for each in (environment, ours):
+            each.reset(seed=seed)
+        if difference := compare_tracks(environment, ours) or compare_state(0, environment, ours.race, tiles=True):
+            print(f"seed {seed}")
+            return difference
+    return None
 
 
 def main() -> None:
-    """Compare, then time."""
+    """Compare."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=20_000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--pictures", type=int, default=0)
+    parser.add_argument("--tracks", type=int, default=100)
     arguments = parser.parse_args()
-    counts, difference = compare(arguments.steps, arguments.seed)
-    print(dict(counts), difference)
-    print("Box2D {:.1f} us a step, native {:.1f}".format(*time_both(5_000)))
-    raise SystemExit(difference is not None)
+    found = compare_seeds(range(arguments.seed, arguments.seed + arguments.tracks))
+    counts, difference = compare(arguments.steps, arguments.seed, arguments.pictures)
+    print(dict(counts), found, difference)
+    raise SystemExit(bool(found or difference))
 
 
 if __name__ == "__main__":

@@ -140,12 +140,16 @@ void contact_follow(Race *race)
 
 /* ---- episodes ---- */
 
-void contact_enter(Race *race)
+void contact_enter_tiles(Race *race)
 {
     for (int i = 0; i < race->tile_count; i++) {
         Tile *tile = &race->tiles[i];
         tile->leaf = tree_add(&race->tree, polygon_box(tile->polygon.corners, tile->polygon.count), i);
     }
+}
+
+void contact_enter_car(Race *race)
+{
     for (int mover = 0; mover < MOVERS; mover++) {
         Fixture *fixture = mover_fixture(race, mover);
         Box box = polygon_box(fixture->world, fixture->polygon.count);
@@ -154,11 +158,17 @@ void contact_enter(Race *race)
     find_contacts(race, (1u << MOVERS) - 1);
 }
 
-void contact_leave(Race *race)
+void contact_leave_tiles(Race *race)
 {
-    race->contact_count = 0;
     for (int i = 0; i < race->tile_count; i++)
         tree_remove(&race->tree, race->tiles[i].leaf);
+    race->tile_count = race->contact_count = 0;
+}
+
+void contact_leave_car(Race *race)
+{
+    while (race->contact_count)
+        drop(race, race->contact_count - 1);
     for (int mover = FIXTURES - 1; mover >= 0; mover--) /* a body's newest fixture first, but its oldest body */
         tree_remove(&race->tree, mover_fixture(race, mover)->leaf);
     for (int mover = FIXTURES; mover < MOVERS; mover++)

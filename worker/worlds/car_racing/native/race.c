@@ -9,7 +9,6 @@ enum { VELOCITY_ROUNDS = 6 * 30, PLACE_ROUNDS = 2 * 30 };
 
 void race_init(Race *race)
 {
-    *race = (Race){0};
     tree_init(&race->tree);
 }
 
@@ -18,7 +17,6 @@ void race_free(Race *race)
     tree_free(&race->tree);
     free(race->tiles);
     free(race->contacts);
-    race_init(race);
 }
 
 static bool reserve(Race *race, int tiles)
@@ -42,30 +40,67 @@ static void advance(Race *race)
     solver_step(&race->island, (float)STEP, VELOCITY_ROUNDS, PLACE_ROUNDS);
     contact_follow(race);
     race->time += STEP;
+    race->shown = race->reward;
 }
 
-bool race_reset(Race *race, const double *corners, int tiles, double angle, double x, double y, double lap_share)
+static void lay_tiles(Race *race)
 {
-    if (race->tile_count)
-        contact_leave(race);
-    race->tile_count = 0;
-    if (!reserve(race, tiles))
-        return false;
-    for (int i = 0; i < tiles; i++, corners += 2 * TILE_CORNERS) {
+    for (const Quad *quad = race->track.quads; race->tile_count < race->track.count; quad++) {
+        if (quad->border)
+            continue;
         Vec points[TILE_CORNERS];
         for (int k = 0; k < TILE_CORNERS; k++)
-            points[k] = (Vec){(float)corners[2 * k], (float)corners[2 * k + 1]};
-        race->tiles[i] = (Tile){.polygon = polygon_hull(points, TILE_CORNERS)};
+            points[k] = (Vec){(float)quad->corners[k].x, (float)quad->corners[k].y};
+        race->tiles[race->tile_count++] = (Tile){.polygon = polygon_hull(points, TILE_CORNERS)};
     }
-    race->tile_count = tiles;
+}
+
+/* Colours are cut to whole numbers as they are drawn. */
+static uint32_t pack(const double *rgb, double more)
+{
+    uint32_t packed = 0;
+    for (int i = 0; i < 3; i++)
+        packed = packed << 8 | ((uint32_t)(rgb[i] + more) & 255);
+    return packed;
+}
+
+Beginning race_reset(Race *race, const double *draws, double lap_share, const double *colours)
+{
+    if (!track_make(&race->track, draws))
+        return NO_TRACK;
+    if (race->tile_count) {
+        contact_leave_tiles(race);
+        contact_leave_car(race);
+    }
+    if (!reserve(race, race->track.count))
+        return NO_MEMORY;
+    lay_tiles(race);
+    for (int i = 0; i < SHADES; i++)
+        race->colours.road[i] = pack(colours, 0.01 * i * 255);
+    race->colours.ground = pack(colours + 3, 0);
+    race->colours.patch = pack(colours + 6, 0);
     race->reward = race->reward_before = race->time = 0;
     race->lap_share = lap_share;
     race->visited = 0;
     race->new_lap = false;
-    car_init(race, angle, x, y);
-    contact_enter(race);
+    const Waypoint *start = race->track.points;
+    car_init(race, start->beta, start->x, start->y);
+    contact_enter_tiles(race);
+    contact_enter_car(race);
     advance(race);
-    return true;
+    return BEGUN;
+}
+
+void race_place(Race *race, double angle, double x, double y)
+{
+    contact_leave_car(race);
+    car_init(race, angle, x, y);
+    contact_enter_car(race);
+}
+
+void race_idle(Race *race)
+{
+    advance(race);
 }
 
 Outcome race_step(Race *race, double steering, double gas, double brake)

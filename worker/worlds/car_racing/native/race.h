@@ -3,11 +3,12 @@
 #define DREAMFLEET_RACE_H
 
 #include "solver.h"
+#include "track.h"
 #include "tree.h"
 
 #include <stdint.h>
 
-enum { MOVERS = FIXTURES + WHEELS, TILE_CORNERS = 4, MOST_TILES = 10000 };
+enum { MOVERS = FIXTURES + WHEELS, SHADES = 3 };
 
 /* What gymnasium keeps of a wheel. */
 typedef struct {
@@ -24,12 +25,19 @@ typedef struct {
     bool plain; /* drawn in the road's own colour: something has come upon it or left it */
 } Tile;
 
+/* As 0xrrggbb: the road's, of one tile after the other, of which the first is the plain one; the field's and its patches'. */
+typedef struct {
+    uint32_t road[SHADES], ground, patch;
+} Colours;
+
 /* A tile and a fixture whose boxes meet. */
 typedef struct {
     int tile, mover;
 } Contact;
 
 typedef struct {
+    Track track;
+    Colours colours;
     Tree tree; /* lives on from episode to episode, as gymnasium's world does */
     Tile *tiles;
     int tile_count;
@@ -38,6 +46,7 @@ typedef struct {
     Island island;
     Wheel wheels[WHEELS];
     double reward, reward_before, time, lap_share;
+    double shown; /* the reward that the picture shows: before the step's time is paid */
     int visited;
     bool new_lap;
 } Race;
@@ -51,9 +60,16 @@ typedef struct {
 void race_init(Race *race);
 void race_free(Race *race);
 
-/* A new episode: tiles of four corners each, the first of the car's place and angle, and one step without an action.
-   False if there is no memory. */
-bool race_reset(Race *race, const double *corners, int tiles, double angle, double x, double y, double lap_share);
+/* A new episode on the track of these draws, and one step without an action. The colours are the road's, the field's and
+   its patches', red, green and blue each. */
+typedef enum { BEGUN, NO_TRACK, NO_MEMORY } Beginning;
+Beginning race_reset(Race *race, const double *draws, double lap_share, const double *colours);
+
+/* A new car at a place; what was visited stays so. */
+void race_place(Race *race, double angle, double x, double y);
+
+/* A step without an action, which pays nothing. */
+void race_idle(Race *race);
 
 Outcome race_step(Race *race, double steering, double gas, double brake);
 
@@ -69,9 +85,11 @@ void car_roll(Race *race, double dt);
 Rigid *mover_body(Race *race, int mover);
 Fixture *mover_fixture(Race *race, int mover);
 
-/* Tiles and car enter and leave the tree. */
-void contact_enter(Race *race);
-void contact_leave(Race *race);
+/* Tiles or the car enter and leave the tree. */
+void contact_enter_tiles(Race *race);
+void contact_enter_car(Race *race);
+void contact_leave_tiles(Race *race);
+void contact_leave_car(Race *race);
 
 /* Contacts begin and end where the bodies are now. */
 void contact_update(Race *race);
