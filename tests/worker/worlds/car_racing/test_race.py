@@ -1,8 +1,12 @@
 """The native race is gymnasium's and Box2D's, to the bit: each body, each wheel, tiles, reward and end.
-Tests native/*.c but for the picture. `python -m tests.worker.worlds.car_racing.truth` compares far more."""
+Tests native/*.c. `python -m tests.worker.worlds.car_racing.truth` compares far more."""
 
 import os
+import platform
+import shutil
+import subprocess
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +16,7 @@ from dreamfleet.worker.worlds.car_racing.environment import is_native_available
 if not is_native_available():
     pytest.skip("no native module was built", allow_module_level=True)
 
-from dreamfleet.worker.worlds.car_racing import _native
+from dreamfleet.worker.worlds.car_racing import _native, environment
 from dreamfleet.worker.worlds.car_racing.environment import COLOURS, DRAWS
 from dreamfleet.worker.worlds.car_racing.reference import Shadow
 from tests.worker.worlds.car_racing.truth import (
@@ -94,6 +98,22 @@ def test_many_steps_tracks_and_pictures_have_the_same_bits():
     counts, difference = compare(steps, seed=77, pictures=10)
     assert difference is None
     assert min(counts[what] for what in ("laps", "fields left", "steps asleep", "pictures")) > 0
+
+
+def fuses_products():
+    """Whether this host's glibc computes sines as those do that the class of hosts is named after."""
+    return platform.machine() == "x86_64" and "fma" in Path("/proc/cpuinfo").read_text().split()
+
+
+@pytest.mark.parametrize("stride", [100_003, pytest.param(1, marks=pytest.mark.long)])
+def test_sines_are_glibcs_where_it_fuses_products(tmp_path, stride):
+    if platform.libc_ver()[0] != "glibc" or not fuses_products() or not shutil.which("cc"):
+        pytest.skip("no compiler, or another host's sines are others")
+    folder, program = Path(environment.__file__).with_name("native"), tmp_path / "turns"
+    here = Path(__file__).with_name("turns.c")
+    flags = ("-std=c11", "-O2", "-mfma", "-ffp-contract=off", "-fno-builtin", f"-I{folder}")
+    subprocess.run(["cc", *flags, "-o", program, here, folder / "turn.c", "-lm"], check=True)
+    assert int(subprocess.run([program, str(stride)], check=True, capture_output=True).stdout) == 0
 
 
 @pytest.fixture

@@ -54,10 +54,8 @@ static inline float vec_length(Vec a)
     return sqrtf(vec_dot(a, a));
 }
 
-static inline Turn turn_by(float angle)
-{
-    return (Turn){sinf(angle), cosf(angle)};
-}
+/* Of turn.c: sine and cosine, the same on every host. */
+Turn turn_by(float angle);
 
 static inline Vec turn_out(Turn turn, Vec local)
 {

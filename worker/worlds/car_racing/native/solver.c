@@ -2,10 +2,8 @@
    and sleep.
 
    What was found of the x86-64 wheel of box2d 2.3.10, by its machine code and by comparing bits: GCC 10 made it for
-   SSE2, with no product fused into a sum and no sum rearranged; sine and cosine are glibc's `sincosf`, whose results
-   are those of `sinf` and `cosf`; `sqrtf` rounds correctly; a Python float is rounded to single precision as soon as it
-   enters. glibc 2.36 itself fuses products in `sinf` and `cosf` where the processor can, and gives other bits for a few
-   angles where it cannot: so does Box2D there, but then the truth differs between processors. */
+   SSE2, with no product fused into a sum and no sum rearranged; sine and cosine are glibc's `sincosf` (turn.c); `sqrtf`
+   rounds correctly; a Python float is rounded to single precision as soon as it enters. */
 
 #include "solver.h"
 
