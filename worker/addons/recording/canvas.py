@@ -1,16 +1,24 @@
 """Drawing one step of a drive as one frame: the world, and beside it what the model sees, decodes and dreams."""
 
+from __future__ import annotations
+
+import logging
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pygame
 from numpy.typing import NDArray
 
 from dreamfleet.common.worlds.profile import WorldProfile
 from dreamfleet.worker.scoring.disturbance import numbered_choices
 from dreamfleet.worker.tasks.api import Actions, Continuous, Discrete
 
+try:
+    import pygame
+except ModuleNotFoundError:  # then videos have pictures without words
+    pygame = None  # type: ignore[assignment]
+
+log = logging.getLogger(__name__)
 SIDE = 192  # pixels of the small pictures: three times or twice their size
 MARGIN, LABEL, GAP = 8, 22, 10
 BACKGROUND, INK, FAINT = (18, 20, 24), (235, 235, 235), (150, 155, 165)
@@ -72,6 +80,8 @@ class Board:
 
     def __init__(self, size: tuple[int, int], names: tuple[str, ...] = (), actions: Actions | None = None) -> None:
         """`names` are those of the actions, and `actions` gives the ends of their bars; by default -1 and 1."""
+        if pygame is None:
+            raise ModuleNotFoundError(name="pygame")
         pygame.font.init()
         self._names, self._actions = names, actions
         self._large = pygame.font.Font(None, 30)
@@ -174,6 +184,38 @@ class Canvas(Board):
             left, top = self._layout.track[0] + 20, MARGIN + row * (LABEL + SIDE + GAP)
             self._text(label, (left, top), self._small, FAINT)
             self._picture(picture, (left, top + LABEL), (SIDE, SIDE))
+
+
+class PlainCanvas:
+    """Draws frames where pygame is missing: the pictures of `Canvas`, in their places, with pixels that one sees."""
+
+    def __init__(self, layout: FrameLayout) -> None:
+        log.warning("pygame is missing: the video shows pictures without words (pip install 'dreamfleet[worker]')")
+        self._layout = layout
+
+    def draw(self, moment: DriveFrame) -> Frame:
+        """The frame `(height, width, 3)`."""
+        width, height = self._layout.size
+        frame = np.full((height, width, 3), BACKGROUND, np.uint8)
+        _paste(frame, moment.track, MARGIN, MARGIN, size_within(self._layout.track, moment.track))
+        pictures = moment.pictures
+        for row, picture in enumerate((pictures.seen, pictures.decoded, pictures.dreamt) if pictures else ()):
+            top = MARGIN + row * (LABEL + SIDE + GAP) + LABEL
+            _paste(frame, picture, self._layout.track[0] + 20, top, (SIDE, SIDE))
+        return frame
+
+
+def make_canvas(
+    seed: int, profile: WorldProfile, layout: FrameLayout, names: tuple[str, ...], actions: Actions | None
+) -> Canvas | PlainCanvas:
+    """What draws a drive's frames here."""
+    return PlainCanvas(layout) if pygame is None else Canvas(seed, profile, layout, names, actions)
+
+
+def _paste(frame: Frame, picture: Frame, left: int, top: int, size: tuple[int, int]) -> None:
+    width, height = size
+    rows, columns = np.arange(height) * picture.shape[0] // height, np.arange(width) * picture.shape[1] // width
+    frame[top : top + height, left : left + width] = picture[rows[:, None], columns]
 
 
 def choice_name(action: NDArray[Any], names: tuple[str, ...], actions: Actions | None) -> str | None:

@@ -56,7 +56,7 @@ class FilmedPolicy:
         self._view = None if bundle is None else WorldModelView(bundle, self._policy, parameters, dreaming)
         self._profile = replace(profile_of(agent.reality), score_word=agent.world.score_word)
         self._step, self._score = 0, 0.0
-        self._canvas: canvas.Canvas | None = None
+        self._canvas: canvas.Canvas | canvas.PlainCanvas | None = None
         self._last: canvas.DriveFrame | None = None
 
     def begin(self, parameters: NDArray[np.float32]) -> None:
@@ -103,7 +103,7 @@ class FilmedPolicy:
         if self._canvas is None:
             layout = canvas.DREAMING if pictures is not None else canvas.plain_layout(picture)
             named = self._world.action_names, self._world.actions
-            self._canvas = canvas.Canvas(self._seed, self._profile, layout, *named)
+            self._canvas = canvas.make_canvas(self._seed, self._profile, layout, *named)
         self._last = canvas.DriveFrame(picture, np.atleast_1d(np.asarray(action)), self._step, self._score, pictures)
         self._on_frame(self._canvas.draw(self._last))
 

@@ -70,7 +70,7 @@ def native_is_exact() -> bool:
 
 def judge_name() -> str:
     """Who judges scores here, as reports say it."""
-    return "gymnasium" if find_reference() else "the native core, with which a drive in gymnasium 1.4.0 agrees"
+    return "gymnasium" if find_reference() else "the native core, checked by the hash of a drive in gymnasium 1.4.0"
 
 
 def random_action(step: int, _picture: Any, random: np.random.Generator) -> NDArray[np.float32]:

@@ -33,6 +33,7 @@ from dreamfleet.worker.worlds.car_racing.random_network import RandomNetworkPoli
 from dreamfleet.worker.worlds.car_racing.true_state import read_true_state
 
 ENVIRONMENT = "CarRacing-v3"
+SPARED = ("pygame-ce", "box2d", "box2d-py")  # packages without which the native core drives and judges alone
 WORLD = World(
     actions=STEERING_GAS_BRAKE,
     packages=FACTS.packages,
@@ -72,10 +73,11 @@ class CarRacingTask(Task):
     agent_world, agent_options, agent_pictures = WORLD, "", PREPROCESSINGS
 
     def world_of(self, assignment: Assignment) -> World:
-        """The world with the actions and costs of the run's variant."""
+        """The world with the actions and costs of the run's variant, and what judges here."""
         variant = assignment.world_model.variant
+        packages = WORLD.packages if find_reference() else tuple(each for each in WORLD.packages if each not in SPARED)
         return replace(
-            WORLD, actions=variant.controls, version=variant.version, time_cost=variant.time_cost,
+            WORLD, packages=packages, actions=variant.controls, version=variant.version, time_cost=variant.time_cost,
             off_course_cost=variant.offroad_cost, judge=judge_name(),
         )  # fmt: skip
 
