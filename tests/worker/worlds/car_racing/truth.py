@@ -26,7 +26,7 @@ Action = tuple[float, float, float]
 Driver = Callable[[int], Action]
 FIELDS = ("x", "y", "angle", "velocity x", "velocity y", "spin", "awake")
 WHEEL_FIELDS = ("omega", "phase", "gas", "brake", "steer", "joint angle", "tiles")
-HULL, FAR = 4, 9e4  # body; metres, within which a car is drawn
+HULL, FAR = 4, 1_000.0  # body; metres, three times the field, within which pictures are compared
 SETTINGS: tuple[dict[str, Any], ...] = (
     {}, {"lap_complete_percent": 0.3}, {"domain_randomize": True}, {"continuous": False},
 )  # fmt: skip
