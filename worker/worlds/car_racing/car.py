@@ -7,16 +7,6 @@ from typing import NamedTuple
 from dreamfleet.worker.worlds.car_racing._native import Race
 
 HULL = 4  # bodies 0 to 3 are the wheels
-Pair = tuple[float, float]
-
-
-class Body(NamedTuple):
-    """The hull: metres, radians and seconds."""
-
-    position: Pair
-    angle: float
-    linearVelocity: Pair  # noqa: N815 - Box2D's name
-    angularVelocity: float  # noqa: N815 - Box2D's name
 
 
 class Joint(NamedTuple):
@@ -25,35 +15,39 @@ class Joint(NamedTuple):
     angle: float
 
 
-class CarWheel(NamedTuple):
-    """A wheel as a body, how it turns, and on how many tiles it stands."""
+class Body(NamedTuple):
+    """The hull or a wheel, in metres, radians and seconds; what only wheels have follows, with the tiles under it."""
 
-    position: Pair
+    position: tuple[float, float]
     angle: float
-    linearVelocity: Pair  # noqa: N815 - Box2D's name
+    linearVelocity: tuple[float, float]  # noqa: N815 - Box2D's name
     angularVelocity: float  # noqa: N815 - Box2D's name
-    omega: float
-    phase: float
-    gas: float
-    brake: float
-    steer: float
-    joint: Joint
-    tiles: int
+    omega: float = 0.0
+    phase: float = 0.0
+    gas: float = 0.0
+    brake: float = 0.0
+    steer: float = 0.0
+    joint: Joint = Joint(0.0)
+    tiles: int = 0
 
 
 class Car(NamedTuple):
     """The hull and its wheels, the front ones first, at one moment."""
 
     hull: Body
-    wheels: tuple[CarWheel, ...]
+    wheels: tuple[Body, ...]
 
 
 def read_car(race: Race) -> Car:
     """The car of a race as it is now."""
-    bodies = [Body((x, y), angle, (vx, vy), spin) for x, y, angle, vx, vy, spin, _ in map(race.body, range(HULL + 1))]
-    turning = map(race.wheel, range(HULL))
-    wheels = (
-        CarWheel(*body, omega, phase, gas, brake, steer, Joint(angle), tiles)
-        for body, (omega, phase, gas, brake, steer, angle, tiles) in zip(bodies, turning, strict=False)
-    )
-    return Car(bodies[HULL], tuple(wheels))
+    return Car(_read_body(race, HULL), tuple(_read_wheel(race, index) for index in range(HULL)))
+
+
+def _read_body(race: Race, index: int) -> Body:
+    x, y, angle, vx, vy, spin, _ = race.body(index)
+    return Body((x, y), angle, (vx, vy), spin)
+
+
+def _read_wheel(race: Race, index: int) -> Body:
+    omega, phase, gas, brake, steer, angle, tiles = race.wheel(index)
+    return Body(*_read_body(race, index)[:4], omega, phase, gas, brake, steer, Joint(angle), tiles)

@@ -33,7 +33,7 @@ static bool reserve(Race *race, int tiles)
 }
 
 /* Wheels push, contacts of the step before begin and end, bodies move, and new contacts are found. */
-static void advance(Race *race)
+void race_idle(Race *race)
 {
     car_roll(race, STEP);
     contact_update(race);
@@ -87,7 +87,7 @@ Beginning race_reset(Race *race, const double *draws, double lap_share, const do
     car_init(race, start->beta, start->x, start->y);
     contact_enter_tiles(race);
     contact_enter_car(race);
-    advance(race);
+    race_idle(race);
     return BEGUN;
 }
 
@@ -98,15 +98,10 @@ void race_place(Race *race, double angle, double x, double y)
     contact_enter_car(race);
 }
 
-void race_idle(Race *race)
-{
-    advance(race);
-}
-
 Outcome race_step(Race *race, double steering, double gas, double brake)
 {
     car_control(race, -steering, gas, brake);
-    advance(race);
+    race_idle(race);
     race->reward -= 0.1;
     Outcome outcome = {race->reward - race->reward_before, GOES_ON};
     race->reward_before = race->reward;
