@@ -273,7 +273,7 @@ def compare(
     while counts["steps"] < steps and difference is None:
         episode = counts["episodes"]
         if episode % fresh_every == 0:
-            settings = SETTINGS[episode // fresh_every % len(SETTINGS)]
+            settings = SETTINGS[(seed + episode // fresh_every) % len(SETTINGS)]
             environment, ours = Shadow(**settings), Ours(**settings)
         name = list(MANNERS)[episode % len(MANNERS)]
         drive = MANNERS[name](environment, np.random.default_rng(seed + episode))
