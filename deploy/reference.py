@@ -112,7 +112,7 @@ example.
 - A setting without a default is unset.
 - A variable holds a list as texts between commas. An empty variable counts as unset, but it empties a text or a list.
 - `DREAMFLEET_CONFIG` names the configuration file, and `DREAMFLEET_CACHE` the folder of downloaded world models.
-- With `DREAMFLEET_PICTURES=gymnasium`, gymnasium draws CarRacing's pictures, which takes 15 times as long. Scores are
+- With `DREAMFLEET_PICTURES=gymnasium`, gymnasium drives and draws CarRacing, which takes 15 times as long. Scores are
   the same.
 - `[[stage]]` tables are described in [stages of one run](../how-to/stages.md), `[[host]]` tables in
   [workers on other hosts](../how-to/hosts.md).
