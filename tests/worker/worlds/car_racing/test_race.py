@@ -175,8 +175,8 @@ def test_there_are_four_wheels(index):
         _native.Race().wheel(index)
 
 
-@pytest.mark.parametrize("place", [(0, np.nan, 0), (np.inf, 0, 0)])
-def test_a_place_is_three_finite_numbers(race, place):
+@pytest.mark.parametrize("place", [(0, np.nan, 0), (np.inf, 0, 0), (0, 0, -2e6)])
+def test_a_place_is_near(race, place):
     with pytest.raises(ValueError):
         race.place(*place)
 
@@ -184,7 +184,8 @@ def test_a_place_is_three_finite_numbers(race, place):
 def test_what_cannot_be_drawn_is_a_clear_error(race):
     with pytest.raises(ValueError):
         race.draw(bytearray(5))
-    race.place(0, 1e30, 0)
+    race.place(0, 5e5, 0)
+    race.step(1, 1, 0)
     with pytest.raises(ValueError):
         race.draw(bytearray(64 * 64 * 3))
     for time in (-1, np.nan, np.inf):

@@ -91,14 +91,17 @@ static PyObject *game_idle(PyObject *self, PyObject *none)
     return Py_NewRef(Py_None);
 }
 
+static const double FURTHEST = 1e6; /* where single precision still tells tiles apart */
+
+/* place(angle, x, y) */
 static PyObject *game_place(PyObject *self, PyObject *args)
 {
     double at[3];
     Race *race = race_of(self);
     if (!race || !PyArg_ParseTuple(args, "ddd", &at[0], &at[1], &at[2]))
         return NULL;
-    if (!all_finite(at, 3)) {
-        PyErr_SetString(PyExc_ValueError, "a place is three finite numbers");
+    if (!(fabs(at[0]) <= FURTHEST && fabs(at[1]) <= FURTHEST && fabs(at[2]) <= FURTHEST)) {
+        PyErr_SetString(PyExc_ValueError, "a place is three numbers of at most a million");
         return NULL;
     }
     race_place(race, at[0], at[1], at[2]);
