@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from dreamfleet.worker.worlds.car_racing._native import Race
+from dreamfleet.worker.worlds.car_racing import _native
 
 HULL = 4  # bodies 0 to 3 are the wheels
 
@@ -38,16 +38,16 @@ class Car(NamedTuple):
     wheels: tuple[Body, ...]
 
 
-def read_car(race: Race) -> Car:
+def read_car(race: _native.Race) -> Car:
     """The car of a race as it is now."""
     return Car(_read_body(race, HULL), tuple(_read_wheel(race, index) for index in range(HULL)))
 
 
-def _read_body(race: Race, index: int) -> Body:
+def _read_body(race: _native.Race, index: int) -> Body:
     x, y, angle, vx, vy, spin, _ = race.body(index)
     return Body((x, y), angle, (vx, vy), spin)
 
 
-def _read_wheel(race: Race, index: int) -> Body:
+def _read_wheel(race: _native.Race, index: int) -> Body:
     omega, phase, gas, brake, steer, angle, tiles = race.wheel(index)
     return Body(*_read_body(race, index)[:4], omega, phase, gas, brake, steer, Joint(angle), tiles)
