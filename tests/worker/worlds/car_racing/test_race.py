@@ -85,8 +85,8 @@ def test_a_car_that_is_put_elsewhere_drives_on_with_the_same_bits():
         for each in sides:
             each.place(beta + 0.3, x + 1, y - 2)
         for step in range(25):
-            told = [each.step(action)[1] for each in sides]
-            assert told[0] == told[1]
+            paid = [each.step(action)[1] for each in sides]
+            assert paid[0] == paid[1]
             assert compare_state(step, sides[0], sides[1].race, tiles=step > 0) is None
 
 

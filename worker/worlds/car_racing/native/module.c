@@ -91,7 +91,7 @@ static PyObject *game_idle(PyObject *self, PyObject *none)
     return Py_NewRef(Py_None);
 }
 
-static const double FURTHEST = 1e6; /* where single precision still tells tiles apart */
+static const double FURTHEST = 1e6; /* where single precision still separates tiles */
 
 /* place(angle, x, y) */
 static PyObject *game_place(PyObject *self, PyObject *args)
