@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import re
 import subprocess
 import sys
@@ -49,16 +50,27 @@ def test_doctor_looks_for_all_that_every_role_requires():
     "script",
     [
         "import dreamfleet.worker.worlds.car_racing.car",
+        "import warnings\nwith warnings.catch_warnings():\n from dreamfleet.worker.worlds.car_racing import "
+        "environment\nassert environment.find_reference()",
         "from dreamfleet.worker.worlds.gym.environments import make_environment as make; make('LunarLander-v3', {})",
         "from dreamfleet.common.host.trusted_modules import import_trusted; import_trusted('Box2D', 'a test')",
     ],
-    ids=["CarRacing", "gymnasium", "a module of the user"],
+    ids=["CarRacing", "CarRacing, whose filters are gone", "gymnasium", "a module of the user"],
 )
 def test_box2d_is_imported_where_warnings_are_errors(script, monkeypatch):
     monkeypatch.setenv("DREAMFLEET_TRUST", "Box2D")
     command = [sys.executable, "-W", "error", "-c", script]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=100)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("task", ["gym:CartPole-v1", "function:math:fsum"])
+def test_tasks_that_need_no_box2d_import_none(task, tmp_path):
+    (tmp_path / "Box2D.py").write_text("import os; os.abort()")
+    seen = {**os.environ, "PYTHONPATH": str(tmp_path), "PYTHONWARNINGS": "error"}
+    command = [sys.executable, "-m", "dreamfleet", "tasks", task]
+    done = subprocess.run(command, env=seen, check=False, capture_output=True, text=True, timeout=100)
+    assert done.returncode in (0, 1), done.stderr
 
 
 BEGIN = (

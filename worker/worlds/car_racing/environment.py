@@ -22,6 +22,7 @@ from gymnasium.error import DependencyNotInstalled, InvalidAction
 from numpy.typing import NDArray
 
 from dreamfleet.common.errors import DreamfleetError
+from dreamfleet.common.host.packages import allow_swig_types
 from dreamfleet.common.printable import plural
 from dreamfleet.worker.worlds.car_racing.preprocessing import BOX, RAW, find_preprocessing
 
@@ -203,6 +204,7 @@ def is_native_available() -> bool:
 @cache
 def find_reference() -> ModuleType | None:
     """The module `reference`, with gymnasium's own environment; `None` where Box2D or pygame cannot be imported."""
+    allow_swig_types()  # again: who imported us may have put the filters of warnings back
     try:
         return import_module("dreamfleet.worker.worlds.car_racing.reference")
     except (ImportError, DependencyNotInstalled) as error:
