@@ -11,7 +11,7 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
-HEAD = "# Written by `make lock` on Python {}.{}, for 3.11 to 3.13, wherever wheels are: use --require-hashes.\n"
+HEAD = "# Written by `make lock` on Python {}.{}, for 3.11 to 3.14, wherever wheels are: use --require-hashes.\n"
 QUIET = ("--no-header", "--no-annotate", "--no-emit-options", "--no-emit-index-url", "--no-emit-find-links")
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 from dreamfleet.common.addons.doctor.health import Finding
+from dreamfleet.common.errors import DreamfleetError
 
 
 def examine() -> Iterator[Finding]:
@@ -14,9 +15,14 @@ def examine() -> Iterator[Finding]:
     except ModuleNotFoundError as error:
         yield Finding("native picture", False, False, f"no {error.name}", "worker", "pip install 'dreamfleet[worker]'")
         return
+    try:
+        is_exact = native_is_exact()
+    except DreamfleetError as error:  # nothing else drives here
+        yield Finding("native picture", False, True, str(error), "worker", "pip install box2d pygame-ce")
+        return
     if not is_native_available():
-        yield Finding("native picture", False, False, "not built", "worker", remedy)
-    elif not native_is_exact():
+        yield Finding("native picture", False, find_reference() is None, "not built", "worker", remedy)
+    elif not is_exact:
         remedy = "install the tested versions of gymnasium and pygame-ce; gymnasium draws until then"
         yield Finding("native picture", False, False, "differs from gymnasium's", "worker", remedy)
     else:

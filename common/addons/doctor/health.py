@@ -27,6 +27,7 @@ ROLES = {
     "dashboard": ("everything", "dashboard"),
     "export": ("everything", "export"),
 }
+SPARED = ("box2d", "pygame-ce")  # without them our native module drives and draws CarRacing
 ABSENT = "-"  # what is found of a thing that is missing
 MIN_FREE_BYTES = 200_000_000
 
@@ -86,7 +87,7 @@ def _check_packages() -> Iterator[Finding]:
         found = package_version(name) or (package_version("box2d-py") if name == "box2d" else None)
         wrong = wrong_version(name)
         ok = found is not None and find_spec(module) is not None and not wrong
-        needed = not extra or extra in ROLES  # other extras are of single tasks
+        needed = not extra or (extra in ROLES and name not in SPARED)  # other extras are of single tasks
         yield Finding(name, ok, needed, found or ABSENT, extra or "everything", wrong or install_command(extra))
 
 

@@ -1,5 +1,5 @@
 """CarRacing where Box2D and pygame cannot be imported: the same scores, and reports say who judged.
-Tests environment.py, native_check.py, task.py and worker/addons/recording/canvas.py."""
+Tests environment.py, native_check.py, task.py, worker/addons/recording/canvas.py and worker/addons/health.py."""
 
 import json
 import os
@@ -55,6 +55,12 @@ def test_the_native_core_drives_and_judges_alone_unless_it_computes_something_el
     assert judge != "gymnasium"
     assert (shape, second) == ("(576, 576, 3)", "refused")
     assert float(reward) > 0
+
+
+def test_such_a_host_can_be_a_worker(tmp_path):
+    report = json.loads(run_hidden(tmp_path, "-m", "dreamfleet", "doctor", "--role", "worker", "--json"))
+    missing = {each["name"] for each in report["checks"] if not each["ok"] and each["role"] == "worker"}
+    assert missing == {"box2d", "pygame-ce"}
 
 
 @pytest.mark.slow
