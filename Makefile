@@ -9,7 +9,7 @@ SOURCES := pyproject.toml constraints.txt $(wildcard worker/worlds/car_racing/na
 # Every process of every test would compile our modules again where an environment forbids the cache.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-doom test-newest short slow setup check long proof box2d-py simulate mutants chaos weekend fuzz sanitize bundle worker-size \
+.PHONY: demo test test-doom pythons test-newest short slow setup check long proof box2d-py simulate mutants chaos weekend fuzz sanitize bundle worker-size \
   stranger reproduce reproduce-evolution messages keyed lock audit sbom structure words site reference clean
 
 demo: $(VENV)/.demo $(if $(filter takecover,$(WORLD)),$(VENV)/.demo-doom)  ## evolve a controller here (WORLD=takecover: there), judge it, plot it, record it
@@ -27,6 +27,9 @@ $(VENV)/.doom: $(VENV)/.dev
 
 test-doom: $(VENV)/.doom  ## the tests that play Doom; they need the package vizdoom, 184 MB
 	$(BIN)/pytest -m "needs_doom and not long" --numprocesses 2 --dist worksteal $(ARGS)
+
+pythons: $(VENV)/.dev  ## the wheel without Box2D, swig and pygame on PYTHONS, by default those that are here: the same bits on all
+	$(BIN)/python deploy/check_wheel.py $(or $(PYTHONS),$(shell deploy/newest_python.sh all))
 
 NEWEST ?= $(shell deploy/newest_python.sh)
 test-newest:  ## a short part of the tests, those without torch, on the newest Python that is here, in its own environment

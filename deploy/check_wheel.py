@@ -2,9 +2,15 @@
 
 The wheel is installed by the documents' own line, and each link of an installed page must lead to an installed file.
 Whatever lies in the current folder, a `worker.py`, a `common/`, a `coordinator.py`, must not be imported for ours.
+
+check_wheel.py PYTHON...: on each of these (`chroot FOLDER python3` is one, if FOLDER shows this machine's TMPDIR), the
+wheel drives, films and evolves CarRacing without Box2D, swig and pygame: to the same bits on all of them.
 """
 
+import hashlib
+import json
 import re
+import shlex
 import subprocess
 import sys
 import tarfile
@@ -37,10 +43,20 @@ NAMES = (
 )
 
 
-def main() -> int:
-    """Exit code 0 if both are complete."""
+ABSENT = ("box2d", "box2d-py", "pygame-ce", "swig")
+EPISODES = ("--controller", "real", "--episodes", "20", "--json")
+SHORT = ("--run", "short", "--population", "4", "--episodes", "1", "--generations", "2", "--horizon", "99")
+
+
+def main(pythons: list[str]) -> int:
+    """Exit code 0 if both are complete, or if all Pythons give the same."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
+        if pythons:
+            run(sys.executable, "-m", "build", "--wheel", "--outdir", str(folder), str(ROOT))
+            (wheel,) = folder.glob("*-cp311-abi3-*.whl")
+            found = {python: drive(shlex.split(python), wheel, folder) for python in pythons}
+            return len({each[1:] for each in found.values()}) - 1
         run(sys.executable, "-m", "build", "--outdir", str(folder), str(ROOT))
         (wheel,), (sdist,) = folder.glob("*.whl"), folder.glob("*.tar.gz")
         for kind, files, known in (
@@ -78,6 +94,33 @@ def try_out(environment: Path, archive: Path, folder: Path) -> str:
         run(*command, "runs", "list", cwd=folder)
     importable = capture(python, "-P", "-c", NAMES, cwd=folder).split()
     return "" if importable == ["dreamfleet"] else f"installs {importable}"
+
+
+def drive(python: list[str], wheel: Path, folder: Path) -> tuple[str, ...]:
+    """Print the version of a Python, and digests of 20 episodes, of a video and of a run's controller there."""
+    version = capture(*python, "-c", "import sys; print(sys.version.split()[0])", cwd=folder).strip()
+    environment, runs = folder / version, folder / version / "runs"
+    run(*python, "-m", "venv", str(environment))
+    inside = (*python[:-1], str(environment / "bin" / "python"), "-m")
+    install = ("pip", "install", "--quiet", "--constraint", str(folder / "constraints.txt"), f"{wheel}[worker,views]")
+    (folder / "constraints.txt").write_text((ROOT / "constraints.txt").read_text())
+    run(*inside, *install)
+    run(*inside, "pip", "uninstall", "--quiet", "--yes", *ABSENT)
+    run(*inside, "dreamfleet", "doctor", "--role", "worker")
+    report = json.loads(capture(*inside, "dreamfleet", "evaluate", *EPISODES, cwd=folder))
+    run(*inside, "dreamfleet", "record", "--controller", "real", "--out", str(environment / "drive.mp4"))
+    where = ("--runs-dir", str(runs))
+    worker = subprocess.Popen([*inside, "dreamfleet", "worker", "--run", "short", "--slots", "1", "--exit-when-done"])
+    try:
+        run(*inside, "dreamfleet", "coordinator", *SHORT, *where)
+        worker.wait(60)
+    finally:
+        worker.kill()
+    drives = [(each["seed"], each["score"], each["steps"]) for each in report["drives"]]
+    files = ((runs / "short" / "controller.npz").read_bytes(), (environment / "drive.mp4").read_bytes())
+    made = (version, *(hashlib.sha256(each).hexdigest()[:16] for each in (repr(drives).encode(), *files)))
+    print(*made, f"{report['mean']:.3f}", report["judge"], flush=True)
+    return made
 
 
 def dead_links(folder: Path) -> list[str]:
@@ -120,4 +163,4 @@ def capture(*command: str, cwd: Path) -> str:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(main(sys.argv[1:]))

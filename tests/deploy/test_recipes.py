@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tomllib
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -27,6 +28,7 @@ DEPLOY = ROOT / "deploy"
 BIN = Path(sys.executable).parent
 KUBERNETES = "1.31"
 UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 EXPOSURE = 2.0  # of 10; systemd-analyze rates up to 5 as OK
 
 
@@ -51,6 +53,25 @@ def test_the_linters_are_content():
     checked(BIN / "hadolint", "--failure-threshold", "style", DEPLOY / "Containerfile")
     checked(BIN / "shellcheck", *DEPLOY.rglob("*.sh"), ROOT / ".ci" / "run")
     checked(BIN / "check-jsonschema", "--builtin-schema", "vendor.compose-spec", DEPLOY / "compose.yaml")
+    checked(BIN / "check-jsonschema", "--builtin-schema", "vendor.github-workflows", *WORKFLOWS)
+
+
+@pytest.mark.skipif(shutil.which("actionlint") is None, reason="needs actionlint on PATH")
+def test_actionlint_is_content():
+    checked("actionlint", "-shellcheck", BIN / "shellcheck", *WORKFLOWS)
+
+
+def test_workflows_test_each_python_that_the_package_names_and_run_what_is_there():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    named = re.findall(r"Python :: (3\.\d+)", "\n".join(project["classifiers"]))
+    jobs = {name: job for path in WORKFLOWS for name, job in yaml.safe_load(path.read_text())["jobs"].items()}
+    assert jobs["short"]["strategy"]["matrix"]["python"] == named
+    targets = [each for job in jobs.values() for step in job["steps"]
+               for each in re.findall(r"make (\w+)", step.get("run", ""))]  # fmt: skip
+    assert targets
+    assert all(f"\n{each}:" in (ROOT / "Makefile").read_text() for each in targets)
+    (image,) = (step["with"] for step in jobs["worker"]["steps"] if "target" in step.get("with", {}))
+    assert f" AS {image['target']}\n" in (ROOT / image["file"]).read_text()
 
 
 def test_compose_starts_what_our_verbs_know():
