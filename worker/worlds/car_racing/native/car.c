@@ -47,11 +47,6 @@ void car_init(Race *race, double angle, double x, double y)
     }
 }
 
-static double sign(double value)
-{
-    return (value > 0) - (value < 0);
-}
-
 void car_control(Race *race, double steer, double gas, double brake)
 {
     Wheel *wheels = race->wheels;

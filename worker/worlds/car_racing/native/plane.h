@@ -54,8 +54,17 @@ static inline float vec_length(Vec a)
     return sqrtf(vec_dot(a, a));
 }
 
-/* Of turn.c: sine and cosine, the same on every host. */
+/* ---- of turn.c: the same on every host ---- */
+
+/* Before any of those in double precision. */
+void turn_init(void);
+
 Turn turn_by(float angle);
+double turn_sine(double angle);
+double turn_cosine(double angle);
+
+/* The angle of (x, y), which are not both 0. */
+double turn_towards(double y, double x);
 
 static inline Vec turn_out(Turn turn, Vec local)
 {
@@ -86,6 +95,11 @@ static inline float larger(float a, float b)
 static inline float clamp(float value, float low, float high)
 {
     return larger(low, smaller(value, high));
+}
+
+static inline double sign(double value)
+{
+    return (value > 0) - (value < 0);
 }
 
 static inline Box box_join(Box a, Box b)

@@ -25,8 +25,8 @@ static View view_of(double zoom, double angle)
         angle += 4 * QUARTER;
     if (fmod(angle + EPSILON, QUARTER) < 2 * EPSILON)
         view.quarter = (int)((angle + EPSILON) / QUARTER) % 4;
-    view.sine = sin(angle);
-    view.cosine = cos(angle);
+    view.sine = turn_sine(angle);
+    view.cosine = turn_cosine(angle);
     return view;
 }
 
@@ -115,16 +115,12 @@ static void car_polygon(const View *view, Pose at, const Vec *corners, int count
     canvas_solid(&canvas, x, y, count, colour, false);
 }
 
-static double sign(double value)
-{
-    return (value > 0) - (value < 0);
-}
-
 /* The light stripe that shows a wheel turning. */
 static void stripe(const View *view, Pose at, double phase)
 {
     double first = phase, second = phase + 1.2;
-    double sine_1 = sin(first), sine_2 = sin(second), cosine_1 = cos(first), cosine_2 = cos(second);
+    double sine_1 = turn_sine(first), sine_2 = turn_sine(second);
+    double cosine_1 = turn_cosine(first), cosine_2 = turn_cosine(second);
     if (sine_1 > 0 && sine_2 > 0)
         return;
     if (sine_1 > 0)
@@ -258,6 +254,7 @@ static void draw_bar(const Race *race, uint8_t *out)
 
 void scene_init(void)
 {
+    turn_init();
     canvas_init(&canvas);
 }
 

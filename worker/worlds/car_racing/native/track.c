@@ -3,16 +3,11 @@
 
 #include "track.h"
 
-#include <math.h>
+#include "plane.h"
 
 static const double PI = 3.14159265358979323846, SCALE = 6, RADIUS = 900 / 6.0, STEP = 21 / 6.0, TURN = 0.31;
 static const double ROAD = 40 / 6.0, BORDER = 8 / 6.0;
 enum { HARD = 4 }; /* turns in a row, the same way, that have a border */
-
-static double sign(double value)
-{
-    return (value > 0) - (value < 0);
-}
 
 typedef struct {
     Waypoint checkpoints[CHECKPOINTS]; /* without beta */
@@ -28,7 +23,7 @@ static void place_checkpoints(Way *way, const double *draws)
             alpha += draws[2 * c];
         else
             radius = 1.5 * RADIUS;
-        way->checkpoints[c] = (Waypoint){alpha, 0, radius * cos(alpha), radius * sin(alpha)};
+        way->checkpoints[c] = (Waypoint){alpha, 0, radius * turn_cosine(alpha), radius * turn_sine(alpha)};
     }
     way->next = 0;
 }
@@ -54,7 +49,7 @@ static int wander(Way *way, Waypoint *points)
     bool other_side = false;
     int count = 0;
     for (int laps = 0; laps <= 4 && count < MOST_POINTS;) {
-        double alpha = atan2(y, x);
+        double alpha = turn_towards(y, x);
         if (other_side && alpha > 0) {
             laps++;
             other_side = false;
@@ -64,7 +59,7 @@ static int wander(Way *way, Waypoint *points)
             alpha += 2 * PI;
         }
         const Waypoint *target = find_target(way, &alpha);
-        double cosine = cos(beta), sine = sin(beta);
+        double cosine = turn_cosine(beta), sine = turn_sine(beta);
         double across = cosine * (target->x - x) + sine * (target->y - y);
         while (beta - alpha > 1.5 * PI)
             beta -= 2 * PI;
@@ -98,7 +93,8 @@ static bool close_lap(Track *track, int count)
     for (int i = 0; i < track->count; i++)
         points[i] = points[first + i];
     const Waypoint *end = &points[track->count - 1];
-    double dx = cos(points[0].beta) * (points[0].x - end->x), dy = sin(points[0].beta) * (points[0].y - end->y);
+    double dx = turn_cosine(points[0].beta) * (points[0].x - end->x);
+    double dy = turn_sine(points[0].beta) * (points[0].y - end->y);
     return sqrt(dx * dx + dy * dy) <= STEP;
 }
 
@@ -116,17 +112,19 @@ static bool turns_hard(const Track *track, int i)
     return ways == HARD || ways == -HARD;
 }
 
-/* The road's side at a point, `out` to the right of its middle. */
-static Vector beside(const Waypoint *point, double out)
+/* The road's side at a point, `out` to the right of its middle; `way` is the cosine and the sine of where it goes. */
+static Vector beside(const Waypoint *point, Vector way, double out)
 {
-    return (Vector){point->x + out * cos(point->beta), point->y + out * sin(point->beta)};
+    return (Vector){point->x + out * way.x, point->y + out * way.y};
 }
 
-static void add_quad(Track *track, int i, double left, double right, bool border)
+static void add_quad(Track *track, const Vector *ways, int i, double left, double right, bool border)
 {
-    const Waypoint *here = &track->points[i], *before = &track->points[(i + track->count - 1) % track->count];
+    int last = (i + track->count - 1) % track->count;
+    const Waypoint *here = &track->points[i], *before = &track->points[last];
     track->quads[track->quad_count++] = (Quad){
-        {beside(here, left), beside(here, right), beside(before, right), beside(before, left)}, i, border};
+        {beside(here, ways[i], left), beside(here, ways[i], right), beside(before, ways[last], right),
+         beside(before, ways[last], left)}, i, border};
 }
 
 bool track_make(Track *track, const double *draws)
@@ -136,18 +134,21 @@ bool track_make(Track *track, const double *draws)
     if (!close_lap(track, wander(&way, track->points)))
         return false;
     bool border[MOST_POINTS];
+    Vector ways[MOST_POINTS];
     int count = track->count;
-    for (int i = 0; i < count; i++)
+    for (int i = 0; i < count; i++) {
         border[i] = turns_hard(track, i);
+        ways[i] = (Vector){turn_cosine(track->points[i].beta), turn_sine(track->points[i].beta)};
+    }
     for (int i = 0; i < count; i++) /* one that reaches back over the first point goes on from the last ones */
         for (int back = 0; back < HARD; back++)
             border[(i - back + count) % count] |= border[i];
     track->quad_count = 0;
     for (int i = 0; i < count; i++) {
-        add_quad(track, i, -ROAD, ROAD, false);
+        add_quad(track, ways, i, -ROAD, ROAD, false);
         double side = sign(track->points[(i + count - 1) % count].beta - track->points[i].beta);
         if (border[i])
-            add_quad(track, i, side * ROAD, side * (ROAD + BORDER), true);
+            add_quad(track, ways, i, side * ROAD, side * (ROAD + BORDER), true);
     }
     return true;
 }
