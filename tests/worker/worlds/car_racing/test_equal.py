@@ -27,7 +27,8 @@ from dreamfleet.worker.worlds.car_racing.environment import (
     write_score,
 )
 from dreamfleet.worker.worlds.car_racing.native_check import (
-    TRUTH,
+    MANNERS,
+    TRUTHS,
     compare,
     hash_drive,
     make_car_racing,
@@ -181,9 +182,11 @@ def test_a_copy_of_the_native_one_is_made_as_its_original():
 
 
 @needs_native
-def test_the_hash_of_a_drive_is_gymnasiums():
-    for kind in (GymnasiumCarRacing, CarRacing):
-        assert hash_drive(kind(), kind(preprocessing=BOX.name)) == TRUTH
+@pytest.mark.parametrize("manner", MANNERS)
+def test_the_hashes_of_drives_are_gymnasiums(manner):
+    truths = TRUTHS[manner].split()
+    assert [hash_drive(CarRacing, manner, seed) for seed in range(len(truths))] == truths
+    assert [hash_drive(GymnasiumCarRacing, manner, seed) for seed in (0, 1)] == truths[:2]
 
 
 @pytest.mark.parametrize("action", [np.array([np.nan, 0, 0]), np.array([0, np.inf, 0]), np.zeros(2), np.zeros((1, 3))])

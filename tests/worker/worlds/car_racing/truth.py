@@ -18,14 +18,17 @@ import numpy as np
 from gymnasium.envs.box2d import car_racing
 
 from dreamfleet.worker.worlds.car_racing.environment import CarRacing
+from dreamfleet.worker.worlds.car_racing.native_check import MANNERS as MANNERS_OF_HASHES
+from dreamfleet.worker.worlds.car_racing.native_check import hash_drive
 from dreamfleet.worker.worlds.car_racing.preprocessing import BOX, RAW
-from dreamfleet.worker.worlds.car_racing.reference import Shadow
+from dreamfleet.worker.worlds.car_racing.reference import GymnasiumCarRacing, Shadow
 from dreamfleet.worker.worlds.car_racing.true_state import centre_line, wrap_angle
 
 Action = tuple[float, float, float]
 Driver = Callable[[int], Action]
 FIELDS = ("x", "y", "angle", "velocity x", "velocity y", "spin", "awake")
 WHEEL_FIELDS = ("omega", "phase", "gas", "brake", "steer", "joint angle", "tiles")
+HASHES = 12  # of each manner
 HULL, FAR = 4, 1_000.0  # body; metres, three times the field, within which pictures are compared
 SETTINGS: tuple[dict[str, Any], ...] = (
     {}, {"lap_complete_percent": 0.3}, {"domain_randomize": True}, {"continuous": False},
@@ -309,7 +312,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--pictures", type=int, default=0)
     parser.add_argument("--tracks", type=int, default=100)
+    parser.add_argument("--hashes", action="store_true", help="print native_check's table instead")
     arguments = parser.parse_args()
+    if arguments.hashes:
+        for manner in MANNERS_OF_HASHES:
+            print(manner, *(hash_drive(GymnasiumCarRacing, manner, seed) for seed in range(HASHES)))
+        return
     found = compare_seeds(range(arguments.seed, arguments.seed + arguments.tracks))
     counts, difference = compare(arguments.steps, arguments.seed, arguments.pictures)
     print(dict(counts), found, difference)

@@ -4,14 +4,9 @@
 #include "canvas.h"
 
 #include <string.h>
-#if defined(__AVX2__)
+#ifdef __AVX2__
 #include <immintrin.h>
-#elif defined(__SSE2__)
-#include <emmintrin.h>
 #endif
-
-#define MIN(a, b) ((a) < (b) ? (a) : (b))
-#define MAX(a, b) ((a) > (b) ? (a) : (b))
 
 /* ---- what lies in the row of cells ---- */
 
@@ -155,7 +150,7 @@ static void bound(const Span *spans, int count, Span *all, Span *any)
 {
     int i = 1;
     *all = *any = spans[0];
-#ifdef __SSE2__
+#ifdef __AVX2__
     if (count > 3) { /* four at a time, some of them twice */
         __m128i most = _mm_loadu_si128((const __m128i *)(spans + count - 4)), least = most;
         for (i = 0; i + 4 < count; i += 4) {
@@ -280,18 +275,6 @@ static inline void paint(uint32_t *row, int left, int right, uint32_t colour)
         _mm_storeu_si128((__m128i *)(to + count - 4), four);
         return;
     }
-#elif defined(__SSE2__)
-    if (count > 3) {
-        __m128i four = _mm_set1_epi32((int)colour);
-        int last = count - 4;
-        for (; last > 4; last -= 8, to += 8) {
-            _mm_storeu_si128((__m128i *)to, four);
-            _mm_storeu_si128((__m128i *)(to + 4), four);
-        }
-        _mm_storeu_si128((__m128i *)(to + MIN(last, 0)), four);
-        _mm_storeu_si128((__m128i *)(to + last), four);
-        return;
-    }
 #endif
     for (int i = 0; i < count; i++)
         to[i] = colour;
@@ -303,24 +286,18 @@ static inline void paint(uint32_t *row, int left, int right, uint32_t colour)
 typedef struct {
 #ifdef __AVX2__
     __m256i wide;
-#endif
-#ifdef __SSE2__
     __m128i colour;
 #else
     uint32_t colour;
 #endif
 } Ink;
 
-#ifdef __SSE2__
+#ifdef __AVX2__
 static Ink ink_of(uint32_t colour)
 {
     __m128i one = _mm_unpacklo_epi8(_mm_cvtsi32_si128((int)colour), _mm_setzero_si128());
-    Ink ink;
-    ink.colour = _mm_unpacklo_epi64(one, one);
-#ifdef __AVX2__
-    ink.wide = _mm256_broadcastsi128_si256(ink.colour);
-#endif
-    return ink;
+    one = _mm_unpacklo_epi64(one, one);
+    return (Ink){_mm256_broadcastsi128_si256(one), one};
 }
 
 static __m128i blend(__m128i under, Ink ink, uint32_t weight)
@@ -346,6 +323,26 @@ static void dots_beside(uint32_t *left, Ink ink, uint32_t weight)
 {
     _mm_storel_epi64((__m128i *)left, blend(_mm_loadl_epi64((const __m128i *)left), ink, weight));
 }
+
+/* Two such pairs; the weights are the second bytes of the first words of `at`'s halves. */
+static __m128i blend_two(__m128i under, Ink ink, __m256i at, __m256i turn)
+{
+    __m256i second = _mm256_set1_epi16((short)0x8001);
+    __m256i w = _mm256_xor_si256(_mm256_shuffle_epi8(at, second), turn);
+    __m256i alpha = _mm256_unpacklo_epi64(_mm256_subs_epu16(_mm256_set1_epi16(254), w),
+                                          _mm256_subs_epu16(w, _mm256_set1_epi16(1)));
+    __m256i sum = _mm256_add_epi16(
+        _mm256_mullo_epi16(_mm256_cvtepu8_epi16(under), _mm256_sub_epi16(_mm256_set1_epi16(256), alpha)),
+        _mm256_mullo_epi16(ink.wide, alpha));
+    sum = _mm256_srli_epi16(sum, 8);
+    return _mm_packus_epi16(_mm256_castsi256_si128(sum), _mm256_extracti128_si256(sum, 1));
+}
+
+static __m256i two_weights(uint32_t at, uint32_t slope)
+{
+    return _mm256_inserti128_si256(_mm256_castsi128_si256(_mm_cvtsi32_si128((int)at)),
+                                   _mm_cvtsi32_si128((int)(at + slope)), 1);
+}
 #else
 static Ink ink_of(uint32_t colour)
 {
@@ -369,28 +366,6 @@ static void dots(uint32_t *near, uint32_t *far, Ink ink, uint32_t weight)
 static void dots_beside(uint32_t *left, Ink ink, uint32_t weight)
 {
     dots(left, left + 1, ink, weight);
-}
-#endif
-
-#ifdef __AVX2__
-/* Two such pairs; the weights are the second bytes of the first words of `at`'s halves. */
-static __m128i blend_two(__m128i under, Ink ink, __m256i at, __m256i turn)
-{
-    __m256i second = _mm256_set1_epi16((short)0x8001);
-    __m256i w = _mm256_xor_si256(_mm256_shuffle_epi8(at, second), turn);
-    __m256i alpha = _mm256_unpacklo_epi64(_mm256_subs_epu16(_mm256_set1_epi16(254), w),
-                                          _mm256_subs_epu16(w, _mm256_set1_epi16(1)));
-    __m256i sum = _mm256_add_epi16(
-        _mm256_mullo_epi16(_mm256_cvtepu8_epi16(under), _mm256_sub_epi16(_mm256_set1_epi16(256), alpha)),
-        _mm256_mullo_epi16(ink.wide, alpha));
-    sum = _mm256_srli_epi16(sum, 8);
-    return _mm_packus_epi16(_mm256_castsi256_si128(sum), _mm256_extracti128_si256(sum, 1));
-}
-
-static __m256i two_weights(uint32_t at, uint32_t slope)
-{
-    return _mm256_inserti128_si256(_mm256_castsi128_si256(_mm_cvtsi32_si128((int)at)),
-                                   _mm_cvtsi32_si128((int)(at + slope)), 1);
 }
 #endif
 
@@ -566,21 +541,20 @@ static void draw(Canvas *canvas, Band *band, uint32_t background)
 
 /* ---- averaging ---- */
 
-#ifdef __SSE2__
+#ifdef __AVX2__
 static __m128i weigh(__m128i value, __m128i weight)
 {
     return _mm_mulhi_epu16(_mm_slli_epi16(value, 2), weight);
 }
 
-/* The sums of the even and the odd ones of a cell's pixels, four 16-bit channels each: of one row, or of two. The first
-   pixel and the last ones have weights. */
-#ifdef __AVX2__
 static __m256i weigh_two(__m256i value, const uint16_t *weights)
 {
     __m128i once = _mm_loadu_si128((const __m128i *)weights);
     return _mm256_mulhi_epu16(_mm256_slli_epi16(value, 2), _mm256_broadcastsi128_si256(once));
 }
 
+/* The sums of the even and the odd ones of a cell's pixels, four 16-bit channels each, of two rows. The first pixel and
+   the last ones have weights. */
 static __m256i add_up(const uint32_t *a, const uint32_t *b, const uint16_t *weights)
 {
     __m256i zero = _mm256_setzero_si256(), sum = zero;
@@ -596,33 +570,13 @@ static __m256i add_up(const uint32_t *a, const uint32_t *b, const uint16_t *weig
     }
     return sum;
 }
-#else
-static __m128i add_up(const uint32_t *row, const uint16_t *weights)
-{
-    __m128i zero = _mm_setzero_si128(), sum = zero;
-    for (int x = 0; x < CELL; x += 4) {
-        __m128i four = _mm_loadu_si128((const __m128i *)(row + x));
-        __m128i low = _mm_unpacklo_epi8(four, zero), high = _mm_unpackhi_epi8(four, zero);
-        if (x == 0)
-            low = weigh(low, _mm_loadu_si128((const __m128i *)weights));
-        if (x == CELL - 4)
-            high = weigh(high, _mm_loadu_si128((const __m128i *)weights + 1));
-        sum = _mm_add_epi16(sum, _mm_add_epi16(low, high));
-    }
-    return sum;
-}
-#endif
 
 /* The averages along cell j of two source rows, side by side. */
 static __m128i average_rows(const Axis *across, const uint32_t *a, const uint32_t *b, int j)
 {
     int x = MARGIN + across->first[j];
-#ifdef __AVX2__
     __m256i both = add_up(a + x, b + x, across->ends[j]);
     __m128i one = _mm256_castsi256_si128(both), other = _mm256_extracti128_si256(both, 1);
-#else
-    __m128i one = add_up(a + x, across->ends[j]), other = add_up(b + x, across->ends[j]);
-#endif
     __m128i sum = _mm_add_epi16(_mm_unpacklo_epi64(one, other), _mm_unpackhi_epi64(one, other));
     return _mm_mulhi_epu16(sum, _mm_set1_epi16((short)across->reciprocal));
 }

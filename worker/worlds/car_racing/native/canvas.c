@@ -3,8 +3,6 @@
 #include "canvas.h"
 
 #include <string.h>
-#define MIN(a, b) ((a) < (b) ? (a) : (b))
-#define MAX(a, b) ((a) > (b) ? (a) : (b))
 
 enum { ONE = 1 << 14 }; /* a whole source pixel's weight */
 

@@ -4,9 +4,6 @@
 
 #include "canvas.h"
 
-#define MIN(a, b) ((a) < (b) ? (a) : (b))
-#define MAX(a, b) ((a) > (b) ? (a) : (b))
-
 static const Span EMPTY = {WIDTH, -1};
 
 static inline Span span_of(int left, int right)
