@@ -28,6 +28,7 @@ int main(int count, char **words)
         double x = cos(wide) * 200, y = sin(wide) * (double)(at % 999), theirs_too = atan2(y, x);
         far += fabs(turn_towards(y, x) - theirs_too) > fabs(theirs_too) * 0x1p-52;
     }
+    differ += turn_towards(0, 0) != 0;
     printf("%llu %llu\n", (unsigned long long)differ, (unsigned long long)far);
     return 0;
 }

@@ -63,7 +63,7 @@ Turn turn_by(float angle);
 double turn_sine(double angle);
 double turn_cosine(double angle);
 
-/* The angle of (x, y), which are not both 0. */
+/* The angle of (x, y). */
 double turn_towards(double y, double x);
 
 static inline Vec turn_out(Turn turn, Vec local)

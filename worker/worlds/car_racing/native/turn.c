@@ -227,6 +227,8 @@ double turn_cosine(double angle)
 double turn_towards(double y, double x)
 {
     double across = fabs(y) < fabs(x) ? fabs(y) : fabs(x), along = fabs(y) < fabs(x) ? fabs(x) : fabs(y);
+    if (!(along > 0))
+        return 0;
     double guess = atan(across / along), beyond;
     int place = place_of(guess);
     Long sine = places[place].sine, cosine = places[place].cosine;
