@@ -108,13 +108,14 @@ def drive(python: list[str], wheel: Path, folder: Path) -> tuple[str, ...]:
     (folder / "constraints.txt").write_text((ROOT / "constraints.txt").read_text())
     run(*inside, *install)
     run(*inside, "pip", "uninstall", "--quiet", "--yes", *ABSENT)
-    run(*inside, "dreamfleet", "doctor", "--role", "worker")
+    run(*inside, "dreamfleet", "doctor", "--role", "worker", cwd=folder)  # not the package of this folder
     report = json.loads(capture(*inside, "dreamfleet", "evaluate", *EPISODES, cwd=folder))
-    run(*inside, "dreamfleet", "record", "--controller", "real", "--out", str(environment / "drive.mp4"))
-    where = ("--runs-dir", str(runs))
-    worker = subprocess.Popen([*inside, "dreamfleet", "worker", "--run", "short", "--slots", "1", "--exit-when-done"])
+    filmed = ("--controller", "real", "--out", str(environment / "drive.mp4"))
+    run(*inside, "dreamfleet", "record", *filmed, cwd=folder)
+    scoring = ("dreamfleet", "worker", "--run", "short", "--slots", "1", "--exit-when-done")
+    worker = subprocess.Popen([*inside, *scoring], cwd=folder)
     try:
-        run(*inside, "dreamfleet", "coordinator", *SHORT, *where)
+        run(*inside, "dreamfleet", "coordinator", *SHORT, "--runs-dir", str(runs), cwd=folder)
         worker.wait(60)
     finally:
         worker.kill()

@@ -21,7 +21,7 @@ def wheel(tmp_path_factory):
 
 
 def run(*words):
-    subprocess.run([str(each) for each in words], check=True)
+    subprocess.run([str(each) for each in words], cwd=BIN, check=True)  # where `dreamfleet` is no folder
 
 
 def test_uv_installs_it(wheel, tmp_path):
